@@ -1,0 +1,25 @@
+"""Differentiable mass-spring dynamics: a body and actions become motion."""
+
+from jaxsimp.dynamics.pickers import NONE, Actions, Pickers, make_pickers
+from jaxsimp.dynamics.rollout import rollout, settle
+from jaxsimp.dynamics.simulation import (
+    Simulation,
+    State,
+    at_rest,
+    largest_time_step,
+    make_simulation,
+)
+
+__all__ = [
+    "NONE",
+    "Actions",
+    "Pickers",
+    "Simulation",
+    "State",
+    "at_rest",
+    "largest_time_step",
+    "make_pickers",
+    "make_simulation",
+    "rollout",
+    "settle",
+]

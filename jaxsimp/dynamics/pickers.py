@@ -1,0 +1,131 @@
+"""Pickers: grasp particles and carry them along displacements, within limits."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+NONE = -1
+"""The particle id of a picker that grasps nothing (None in Eq. 1 of the paper)."""
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["pick", "displacement"], meta_fields=[])
+@dataclass(frozen=True)
+class Actions:
+    """A plan: what each picker grasps and how far it moves (Eq. 1 of the paper).
+
+    Attributes:
+        pick: particle ids, or `NONE`, shape (T, G), or (G,) for one action.
+        displacement: shape (T, G, 3), or (G, 3), metres.
+    """
+
+    pick: Int[Array, "*T G"]
+    displacement: Float[Array, "*T G 3"]
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["limits", "max_stretch"], meta_fields=["steps"]
+)
+@dataclass(frozen=True)
+class Pickers:
+    """How pickers may move.
+
+    Attributes:
+        limits: largest displacement of one action along x, y, z, shape (3,), metres.
+        max_stretch: two held particles must stay closer than this times their rest distance.
+        steps: time steps that one action takes, static.
+    """
+
+    limits: Float[Array, " 3"]
+    max_stretch: Float[Array, ""]
+    steps: int
+
+
+def make_pickers(
+    limits: tuple[float, float, float] = (0.08, 0.08, 0.08),
+    max_stretch: float = 1.2,
+    steps: int = 150,
+) -> Pickers:
+    """Pickers with the stretch rule of SoftGym (1.2) and the limits of the paper's author.
+
+    Raises:
+        ValueError: if a limit or the number of steps is not positive, or the stretch is not
+            above 1.
+    """
+    if len(limits) != 3 or not all(0 < limit < float("inf") for limit in limits):
+        raise ValueError(f"limits is {limits}; give three positive displacements in metres")
+    if not max_stretch > 1:
+        raise ValueError(f"max_stretch is {max_stretch}; give a ratio above 1")
+    if steps < 1:
+        raise ValueError(f"steps is {steps}; an action takes at least 1 time step")
+    return Pickers(jnp.asarray(limits, dtype=float), jnp.asarray(max_stretch, dtype=float), steps)
+
+
+def speed_profile(steps: int) -> Float[Array, " steps"]:
+    """Share of a displacement made in each time step: starts and ends at rest, sums to 1.
+
+    The parabola 6 t (1 - t) of a cubic position profile, sampled at the middle of each step.
+    """
+    middle = (jnp.arange(steps) + 0.5) / steps
+    speed = middle * (1.0 - middle)
+    return speed / speed.sum()
+
+
+def grasp(
+    pickers: Pickers,
+    rest: Float[Array, "N 3"],
+    floor: Float[Array, ""],
+    position: Float[Array, "N 3"],
+    action: Actions,
+) -> tuple[Bool[Array, " N"], Float[Array, "N 3"]]:
+    """Which particles are held during an action, and where each of them is carried.
+
+    Displacements are clipped to the limits and to the table. A particle goes to the first
+    picker that names it. The motion of two pickers is refused, C(a) < 0 of Eq. 2, when it
+    would end with their particles at `max_stretch` times their rest distance or farther; both
+    then hold still. (On a straight path the distance of two particles is convex in time, so
+    no state on the way is farther apart than both its ends.)
+
+    Args:
+        pickers: the limits.
+        rest: rest coordinates of the body, metres.
+        floor: lowest height of a particle, metres.
+        position: of the particles, metres.
+        action: one action, shapes (G,) and (G, 3).
+
+    Returns:
+        held: shape (N,).
+        displacement: of each held particle, zero elsewhere, shape (N, 3), metres.
+    """
+    holds = _holds(action.pick)
+    start = position[action.pick]
+    target = start + jnp.clip(action.displacement, -pickers.limits, pickers.limits)
+    target = target.at[:, 2].max(floor)
+    allowed = _allowed(pickers, rest[action.pick], target, holds)
+    moves = jnp.where(allowed[:, None], target - start, 0.0)
+    chosen = holds[:, None] & (action.pick[:, None] == jnp.arange(len(position)))
+    return chosen.any(axis=0), chosen.T.astype(moves.dtype) @ moves
+
+
+def _holds(pick: Int[Array, " G"]) -> Bool[Array, " G"]:
+    """Whether each picker holds a particle: it names one that no earlier picker names."""
+    earlier = jnp.tril(pick[:, None] == pick[None, :], k=-1).any(axis=1)
+    return (pick != NONE) & ~earlier
+
+
+def _allowed(
+    pickers: Pickers,
+    rest: Float[Array, "G 3"],
+    target: Float[Array, "G 3"],
+    holds: Bool[Array, " G"],
+) -> Bool[Array, " G"]:
+    """Whether each picker's motion keeps the stretch rule with every other picker."""
+
+    def squared_distances(points: Float[Array, "G 3"]) -> Float[Array, "G G"]:
+        return jnp.sum((points[:, None] - points[None, :]) ** 2, axis=-1)
+
+    too_far = squared_distances(target) >= pickers.max_stretch**2 * squared_distances(rest)
+    others = holds[:, None] & holds[None, :] & ~jnp.eye(len(holds), dtype=bool)
+    return ~(too_far & others).any(axis=1)
