@@ -35,7 +35,8 @@ class Body:
             for a cloth.
 
     Raises:
-        ValueError: if an array has the wrong shape or a value that no body can have.
+        ValueError: if an array has the wrong shape or a value that no body can have, if there
+            are no particles, or if a spring joins a particle to itself or a pair joined before.
     """
 
     name: str
@@ -234,6 +235,7 @@ def _grid_faces(grid: np.ndarray) -> np.ndarray:
 
 def _check_arrays(body: Body) -> None:
     count, num_springs = len(body.rest), len(body.springs)
+    _require_count("num_particles", count, 1)
     expected = {
         "rest": (count, 3),
         "mass": (count,),
@@ -256,6 +258,13 @@ def _check_arrays(body: Body) -> None:
                 f"{name} names particle {ids.max() if ids.max() >= count else ids.min()}; "
                 f"a body of {count} particles has ids 0 to {count - 1}"
             )
+    pairs, times = np.unique(np.sort(body.springs, axis=1), axis=0, return_counts=True)
+    for fault, bad in (
+        ("joins a particle to itself", pairs[:, 0] == pairs[:, 1]),
+        ("is there twice", times > 1),
+    ):
+        if bad.any():
+            raise ValueError(f"the spring {pairs[bad][0].tolist()} {fault}; leave it out")
 
 
 def _require_count(name: str, value: int, least: int) -> None:
@@ -264,10 +273,10 @@ def _require_count(name: str, value: int, least: int) -> None:
 
 
 def _require_positive(name: str, value: float | np.ndarray) -> None:
-    if not np.all(np.asarray(value) > 0):
-        raise ValueError(f"{name} is {np.min(value):g}; give a number above zero")
+    if not np.all((np.asarray(value) > 0) & np.isfinite(value)):
+        raise ValueError(f"{name} is {np.min(value):g}; give a finite number above zero")
 
 
 def _require_at_least_zero(name: str, value: float | np.ndarray) -> None:
-    if not np.all(np.asarray(value) >= 0):
-        raise ValueError(f"{name} is {np.min(value):g}; give zero or more")
+    if not np.all((np.asarray(value) >= 0) & np.isfinite(value)):
+        raise ValueError(f"{name} is {np.min(value):g}; give a finite number, zero or more")

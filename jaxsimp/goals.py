@@ -20,10 +20,18 @@ def flat(body: Body, angle: float = 0.0) -> Positions:
         body: any body.
         angle: rotation about the vertical through the origin, radians.
     """
+    return turn(body.rest + np.array([0.0, 0.0, body.radius]), angle)
+
+
+def turn(positions: Positions, angle: float) -> Positions:
+    """Positions turned about the vertical through the origin, shape (N, 3).
+
+    Args:
+        positions: shape (N, 3), metres.
+        angle: counter-clockwise seen from above, radians.
+    """
     cos, sin = np.cos(angle), np.sin(angle)
-    positions = body.rest @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    positions[:, 2] += body.radius
-    return positions
+    return positions @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def polyline(body: Body, corners: Float[np.ndarray, "M 2"]) -> Positions:
@@ -43,7 +51,7 @@ def polyline(body: Body, corners: Float[np.ndarray, "M 2"]) -> Positions:
     if corners.ndim != 2 or corners.shape[0] < 2 or corners.shape[1] != 2:
         raise ValueError(f"corners has shape {corners.shape}; (M, 2) with M of 2 or more is needed")
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-    if not arc[-1] > 0:
+    if not 0 < arc[-1] < np.inf:
         raise ValueError(f"the polyline is {arc[-1]:g} m long; give corners that are apart")
     along = np.linspace(0.0, arc[-1], body.num_particles)
     xy = [np.interp(along, arc, corners[:, axis]) for axis in range(2)]
@@ -67,10 +75,10 @@ def fold(
     point: Float[np.ndarray, " 2"],
     direction: Float[np.ndarray, " 2"],
 ) -> Positions:
-    """Fold about a line: what lies to its left is laid, mirrored, on what lies to its right.
+    """Fold about a line: what lies to its left is turned over onto what lies to its right.
 
-    The folded layer rests on the other one, a thickness (twice the radius) higher; particles
-    on the line form the crease between the two.
+    The folded layers rest on the highest of the others, a thickness (twice the radius) higher;
+    particles on the line form the crease, a radius higher than they were.
 
     Args:
         body: the body whose thickness separates the layers.
@@ -79,19 +87,24 @@ def fold(
         direction: x and y of the line's direction; its length does not matter.
 
     Raises:
-        ValueError: if the direction has no length.
+        ValueError: if the direction has no length, or the line is not finite.
     """
     direction = np.asarray(direction, dtype=float)
     norm = np.linalg.norm(direction)
-    if not norm > 0:
-        raise ValueError(f"direction is {direction.tolist()}; give a vector with a length")
+    if not 0 < norm < np.inf:
+        raise ValueError(f"direction is {direction.tolist()}; give a finite vector with a length")
+    point = np.asarray(point, dtype=float)
+    if not np.isfinite(point).all():
+        raise ValueError(f"point is {point.tolist()}; give finite coordinates in metres")
     left = np.array([-direction[1], direction[0]]) / norm
-    distance = (positions[:, :2] - np.asarray(point)) @ left
+    distance = (positions[:, :2] - point) @ left
     # A particle nearer to the line than rounding can tell is on the crease.
     side = np.where(np.abs(distance) < 1e-6 * body.size, 0.0, np.sign(distance))
     folded = positions.copy()
     folded[:, :2] -= np.where(side > 0, 2 * distance, 0.0)[:, None] * left
-    folded[:, 2] += body.radius * (1 + side)
+    z = positions[:, 2]
+    top = z[side <= 0].max(initial=body.radius) + body.radius
+    folded[:, 2] = np.select([side > 0, side == 0], [2 * top - z, z + body.radius], z)
     return folded
 
 

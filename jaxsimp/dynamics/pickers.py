@@ -38,8 +38,8 @@ class Pickers:
         steps: time steps that one action takes, static.
     """
 
-    limits: Float[Array, " 3"]
-    max_stretch: Float[Array, ""]
+    limits: Float[Array, "... 3"]
+    max_stretch: Float[Array, "..."]
     steps: int
 
 
@@ -85,7 +85,7 @@ def grasp(
     Displacements are clipped to the limits and to the table. A particle goes to the first
     picker that names it. The motion of two pickers is refused, C(a) < 0 of Eq. 2, when it
     would end with their particles at `max_stretch` times their rest distance or farther; both
-    then hold still. (On a straight path the distance of two particles is convex in time, so
+    then hold still, which may refuse the motion of a third. (On a straight path the distance of two particles is convex in time, so
     no state on the way is farther apart than both its ends.)
 
     Args:
@@ -101,11 +101,13 @@ def grasp(
     """
     holds = _holds(action.pick)
     start = position[action.pick]
-    target = start + jnp.clip(action.displacement, -pickers.limits, pickers.limits)
+    target = start + jnp.clip(action.displacement, -pickers.limits[None], pickers.limits[None])
     target = target.at[:, 2].max(floor)
-    allowed = _allowed(pickers, rest[action.pick], target, holds)
-    moves = jnp.where(allowed[:, None], target - start, 0.0)
-    chosen = holds[:, None] & (action.pick[:, None] == jnp.arange(len(position)))
+    for _ in range(max(1, len(holds) - 1)):  # a pass that changes something stops a picker
+        allowed = _allowed(pickers, rest[action.pick], target, holds)
+        target = jnp.where(allowed[:, None], target, start)
+    moves = target - start
+    chosen = holds[:, None] & (action.pick[:, None] == jnp.arange(len(position))[None])
     return chosen.any(axis=0), chosen.T.astype(moves.dtype) @ moves
 
 

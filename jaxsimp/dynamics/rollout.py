@@ -44,9 +44,7 @@ def rollout(
     @jax.checkpoint
     def act(packed: Packed, action: Actions) -> tuple[Packed, PyTree[Any]]:
         position = _unpack(simulation, packed).position
-        held, displacement = grasp(
-            pickers, simulation.rest, simulation.radius, position, action
-        )
+        held, displacement = grasp(pickers, simulation.rest, simulation.radius, position, action)
         drive = displacement.T / simulation.time_step
         packed = _steps(simulation, packed, held, drive, speed_profile(pickers.steps))
         return packed, observe(_unpack(simulation, packed))
@@ -88,8 +86,8 @@ def _step(
 ) -> Packed:
     """One semi-implicit Euler step: forces, velocities, contact, then positions."""
     position, velocity = packed
-    halo, mass, dt = simulation.springs.halo, simulation.mass, simulation.time_step
-    here = slice(halo, halo + len(mass))
+    halo, mass, dt = simulation.springs.halo, simulation.mass[None], simulation.time_step
+    here = slice(halo, halo + mass.size)
     force = spring_forces(simulation.springs, position, velocity)
     down = jnp.array([0.0, 0.0, 1.0], dtype=force.dtype)[:, None]
     slowed = velocity[:, here] * (1.0 - dt * simulation.drag) - dt * simulation.gravity * down
@@ -97,7 +95,7 @@ def _step(
     free = (mass * slowed + dt * force) / mass
     height = position[2, here] - simulation.radius
     free = table_contact(height, free, simulation.friction, dt)
-    moved = jnp.where(held, velocity_held, free)
+    moved = jnp.where(held[None], velocity_held, free)
     return (
         jax.lax.dynamic_update_slice(position, position[:, here] + dt * moved, (0, halo)),
         jax.lax.dynamic_update_slice(velocity, moved, (0, halo)),

@@ -41,10 +41,10 @@ class Springs:
     """
 
     offsets: tuple[int, ...]
-    stiffness: Float[Array, "D HN"]
-    damping: Float[Array, "D HN"]
-    rest_length: Float[Array, "D HN"]
-    shortest: Float[Array, ""]
+    stiffness: Float[Array, "... D HN"]
+    damping: Float[Array, "... D HN"]
+    rest_length: Float[Array, "... D HN"]
+    shortest: Float[Array, "..."]
 
     @property
     def halo(self) -> int:

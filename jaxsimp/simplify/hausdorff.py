@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+THIN = 1e-9  # height over longest edge, below which a triangle is treated as that edge
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -77,7 +79,7 @@ def sample_surface(surface: Surface, spacing: float) -> Float[np.ndarray, "P 3"]
     return np.concatenate(
         [
             (_barycentric_grid(count) @ corners[divisions == count]).reshape(-1, 3)
-            for count in np.unique(divisions)
+            for count in np.unique(divisions).tolist()
         ]
     )
 
@@ -95,6 +97,24 @@ def _farthest(samples: np.ndarray, surface: Surface) -> float:
     import igl
 
     points = np.asarray(surface.points, dtype=np.float64)
-    faces = np.asarray(surface.faces, dtype=np.int64)
-    squared, _, _ = igl.point_mesh_squared_distance(samples, points, faces)
+    squared, _, _ = igl.point_mesh_squared_distance(
+        np.asarray(samples, dtype=np.float64), points, _without_slivers(points, surface.faces)
+    )
     return float(np.sqrt(squared.max()))
+
+
+def _without_slivers(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Triangles, with those of rounded height zero replaced by their longest edges (a, b, b).
+
+    libigl takes such an edge for a segment, but projects onto the plane of a triangle whose
+    normal is all rounding, and then errs by a good part of the triangle's size.
+    """
+    corners = points[faces]
+    edges = np.roll(corners, -1, axis=1) - corners
+    lengths = np.linalg.norm(edges, axis=2)
+    height_by_edge = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    thin = height_by_edge <= THIN * lengths.max(axis=1) ** 2
+    longest = lengths.argmax(axis=1)
+    rows = np.arange(len(faces))
+    start, end = faces[rows, longest], faces[rows, (longest + 1) % 3]
+    return np.where(thin[:, None], np.stack([start, end, end], axis=1), faces).astype(np.int64)

@@ -1,0 +1,1 @@
+"""Studies that lean on jaxsimp: `python -m experiments.run`."""

@@ -1,0 +1,183 @@
+"""What the paper's study leaves behind: summary.json, figures, and a report that shows them."""
+
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from experiments.paper import PLANS_FOLDER, SUCCESS_SCORE, Study, key_points
+from experiments.records import write_json
+from jaxsimp import viz
+from jaxsimp.planning import load_plan
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Rows = list[dict[str, Any]]
+LABELS = {
+    "key_points": "key points",
+    "all_particles": "all particles",
+    "categorical": "categorical",
+    "gaussian_index": "Gaussian index",
+}
+
+
+def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
+    """Write `summary.json`, the figures and `report.md`."""
+    write_json(folder / "summary.json", summary)
+    figures = folder / "figures"
+    figures.mkdir(exist_ok=True)
+    tasks = {name: study.task(name) for name in study.tasks}
+    models = {name: key_points(task) for name, task in tasks.items()}
+    rows = summary["runs"]
+    _save(viz.plot_model_errors(models), figures / "model_errors.png")
+    shown = {name: (task.body, task.goal, models[name]) for name, task in tasks.items()}
+    _save(viz.plot_models(shown), figures / "models.png")
+    _save(viz.plot_costs({name: _costs(_of(rows, task=name)) for name in tasks}),
+          figures / "costs.png")
+    for name, task in tasks.items():
+        plans = _typical_plans(_of(rows, task=name), folder)
+        seed = _typical_seed(_of(rows, task=name))
+        figure = viz.plot_executions(task.body, task.episode_fn(seed).goal, plans, name)
+        _save(figure, figures / f"plans_{name}.png")
+    (folder / "report.md").write_text(_report(study, summary))
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def _of(rows: Rows, **fields: Any) -> Rows:
+    return [row for row in rows if all(row[name] == value for name, value in fields.items())]
+
+
+def _methods(rows: Rows) -> dict[str, Rows]:
+    """Rows by method, in the order in which methods first appear."""
+    methods: dict[str, Rows] = defaultdict(list)
+    for row in rows:
+        name = f"{LABELS[row['action_space']]}, {LABELS[row['pick_encoding']]}"
+        methods[name].append(row)
+    return methods
+
+
+def _costs(rows: Rows) -> dict[str, np.ndarray]:
+    """Cost of the best plan so far, a row a run; nothing finite yet counts as not a number."""
+    return {
+        method: np.array([row["cost_per_iteration"] for row in runs], dtype=float)
+        for method, runs in _methods(rows).items()
+    }
+
+
+def _typical_seed(rows: Rows) -> int:
+    """The seed whose score is the median one of the first method: neither best nor worst."""
+    runs = next(iter(_methods(rows).values()))
+    return sorted(runs, key=lambda row: _score(row))[len(runs) // 2]["seed"]
+
+
+def _score(row: dict[str, Any]) -> float:
+    return -np.inf if row["final_score"] is None else row["final_score"]
+
+
+def _typical_plans(rows: Rows, folder: Path) -> dict[str, tuple[np.ndarray, float]]:
+    """Positions and score of the plan of the typical seed, by method."""
+    chosen = _methods(_of(rows, seed=_typical_seed(rows)))
+    return {
+        method: (load_plan(folder / run["plan"])[1]["positions"], _score(run))
+        for method, (run,) in chosen.items()
+    }
+
+
+def success_interval(successes: int, count: int) -> tuple[float, float]:
+    """Wilson's 95 % confidence interval of a success rate."""
+    from scipy import stats
+
+    found = stats.binomtest(successes, count).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
+
+
+def _report(study: Study, summary: dict[str, Any]) -> str:
+    lines = [
+        "# Goal-conditioned model simplification: the paper's study",
+        "",
+        f"A plan succeeds when its settled score is at least {SUCCESS_SCORE}. Score 1 is the goal, "
+        f"0 the start. {study.seeds} seeds a row; intervals are 95 % "
+        "(Wilson for rates, Student's t in the figures).",
+        "",
+        *_model_table(summary["models"]),
+        "",
+        *_run_table(summary["runs"]),
+        "",
+        "## Model error by number of key points",
+        "![model errors](figures/model_errors.png)",
+        "",
+        "## Simplified models over their goals",
+        "![models](figures/models.png)",
+        "",
+        "## Cost of the best plan by iteration, mean and 95 % interval over seeds",
+        "![costs](figures/costs.png)",
+        "",
+        "## Executed plans",
+        "For each task the seed whose score is the median of the first method.",
+        *(f"![plans](figures/plans_{name}.png)" for name in study.tasks),
+        "",
+        *_provenance(summary["environment"]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> list[str]:
+    header = list(header)
+    return [
+        "| " + " | ".join(map(str, cells)) + " |"
+        for cells in [header, ["---"] * len(header), *rows]
+    ]
+
+
+def _model_table(models: list[dict[str, Any]]) -> list[str]:
+    return _table(
+        ["task", "key points", "particles", "model error (mm)", "threshold (mm)", "method"],
+        (
+            [m["task"], len(m["key_points"]), m["key_points"], f"{1e3 * m['errors'][-1]:.2f}",
+             f"{1e3 * m['threshold']:.1f}", m["method"]]
+            for m in models
+        ),
+    )
+
+
+def _run_table(rows: Rows) -> list[str]:
+    table = []
+    for task in dict.fromkeys(row["task"] for row in rows):
+        for method, runs in _methods(_of(rows, task=task)).items():
+            scores = np.array([_score(run) for run in runs])
+            successes = sum(run["success"] for run in runs)
+            low, high = success_interval(successes, len(runs))
+            table.append([
+                task,
+                method,
+                f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})",
+                f"{successes}/{len(runs)} ({low:.2f} to {high:.2f})",
+                runs[0]["rollouts"],
+                sum(run["non_finite"] for run in runs),
+                f"{np.median([run['plan_seconds'] for run in runs]):.1f}",
+                f"{sum(run['compile_seconds'] for run in runs):.1f}",
+            ])
+    return _table(
+        ["task", "method", "score: median (range)", "success rate (95 %)", "rollouts a plan",
+         "not finite", "seconds to plan", "compile seconds, all runs"],
+        table,
+    )
+
+
+def _provenance(environment: dict[str, Any]) -> list[str]:
+    versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
+    return [
+        "## Provenance",
+        f"Commit `{environment['commit']}`; Python {environment['python']}; {versions}; "
+        f"{environment['processor']}, {environment['cores']} cores; {environment['platform']}. "
+        f"Rows in `runs.jsonl`, plans in `{PLANS_FOLDER}/`, settings in `config.json`.",
+    ]

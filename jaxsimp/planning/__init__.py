@@ -1,0 +1,25 @@
+"""Planning: a task and the particles that may be grasped become a plan."""
+
+from jaxsimp.planning.actions import ENCODINGS, ActionSpace, Categorical, Encoding, GaussianIndex
+from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.plan import Execution, Plan, Planner, load_plan, save_plan
+from jaxsimp.planning.population import Layout, PopulationMap, default_layout
+
+__all__ = [
+    "ENCODINGS",
+    "ActionSpace",
+    "CEMConfig",
+    "Categorical",
+    "Encoding",
+    "Execution",
+    "GaussianIndex",
+    "Layout",
+    "Plan",
+    "Planner",
+    "PopulationMap",
+    "Search",
+    "default_layout",
+    "load_plan",
+    "save_plan",
+    "search",
+]

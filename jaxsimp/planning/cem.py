@@ -1,0 +1,179 @@
+"""The cross-entropy method: draw plans, keep the best, fit the distribution to them.
+
+Rubinstein, "The cross-entropy method for combinatorial and continuous optimization",
+Methodology and Computing in Applied Probability, 1999.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from jaxsimp.dynamics import Actions
+from jaxsimp.planning.actions import ActionSpace, Encoding
+
+
+@dataclass(frozen=True)
+class CEMConfig:
+    """Settings of the cross-entropy method.
+
+    Attributes:
+        num_iterations: rounds of sampling and fitting.
+        population: plans drawn in each round.
+        elite_fraction: share of the population that the distribution is fitted to.
+        smoothing: share of the old distribution that is kept in each update.
+        initial_spread: deviation of the first displacements, in units of the limits.
+        keep_best: put the best plan so far among the elites of each round.
+        returns: the "best" plan that was drawn, or the "mean" of the last distribution.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+
+    num_iterations: int = 15
+    population: int = 128
+    elite_fraction: float = 0.1
+    smoothing: float = 0.1
+    initial_spread: float = 0.7
+    keep_best: bool = True
+    returns: Literal["best", "mean"] = "best"
+
+    def __post_init__(self) -> None:
+        for name in ("num_iterations", "population"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
+        if not 0 < self.elite_fraction <= 1:
+            raise ValueError(f"elite_fraction is {self.elite_fraction}; give more than 0, at most 1")
+        if not 0 <= self.smoothing < 1:
+            raise ValueError(f"smoothing is {self.smoothing}; give at least 0 and less than 1")
+        if not 0 < self.initial_spread < np.inf:
+            raise ValueError(f"initial_spread is {self.initial_spread}; give a number above 0")
+        if self.returns not in ("best", "mean"):
+            raise ValueError(f'returns is {self.returns}; give "best" or "mean"')
+
+    @property
+    def num_elites(self) -> int:
+        """Plans that the distribution is fitted to, at least 2 where there are as many."""
+        return min(self.population, max(2, round(self.elite_fraction * self.population)))
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a search found.
+
+    Attributes:
+        actions: the plan, shapes (T, G) and (T, G, 3).
+        cost: of that plan; infinite if no rollout was finite.
+        best_costs: lowest cost so far after each iteration.
+        elite_costs: mean cost of the elites of each iteration.
+        num_rollouts: plans evaluated.
+        non_finite: how many of them had a cost that is not finite.
+    """
+
+    actions: Actions
+    cost: float
+    best_costs: tuple[float, ...]
+    elite_costs: tuple[float, ...]
+    num_rollouts: int
+    non_finite: int
+
+
+EvaluateFn = Callable[[Actions], Float[np.ndarray, " B"]]
+"""Costs of a batch of plans, leading axis `B`."""
+
+
+def search(
+    space: ActionSpace,
+    encoding: Encoding,
+    config: CEMConfig,
+    key: PRNGKeyArray,
+    evaluate_fn: EvaluateFn,
+    on_iteration: Callable[[], None] = lambda: None,
+) -> Search:
+    """Search for a plan of low cost.
+
+    A rollout whose cost is not finite ranks last and is counted.
+
+    Args:
+        space: the plans that may be searched.
+        encoding: of plans as samples of a distribution.
+        config: settings.
+        key: of the random draws.
+        evaluate_fn: costs of `population` plans at a time, or of one.
+        on_iteration: called after each iteration.
+    """
+    distribution = encoding.init(space, config.initial_spread)
+    best, best_cost = None, np.inf
+    best_costs, elite_costs, non_finite = [], [], 0
+    for key_iteration in jax.random.split(key, config.num_iterations):
+        samples, actions = _ask(encoding, config.population, space, distribution, key_iteration)
+        costs, failed = _rank_last(evaluate_fn(actions))
+        non_finite += failed
+        if config.keep_best and best is not None:
+            samples, costs = _prepend(best, samples), np.append(best_cost, costs)
+        order = np.argsort(costs, kind="stable")[: config.num_elites]
+        if best is None or costs[order[0]] < best_cost:
+            best, best_cost = _take(samples, order[0]), float(costs[order[0]])
+        elites = _take(samples, order)
+        distribution = _tell(encoding, space, distribution, elites, config.smoothing)
+        best_costs.append(best_cost)
+        elite_costs.append(float(costs[order].mean()))
+        on_iteration()
+    num_rollouts = config.num_iterations * config.population
+    if config.returns == "mean":
+        best = encoding.mean(space, distribution)
+        one = jax.tree.map(lambda array: array[None], encoding.decode(space, best))
+        costs, failed = _rank_last(evaluate_fn(one))
+        best_cost = float(costs[0])
+        non_finite += failed
+        num_rollouts += 1
+    return Search(
+        encoding.decode(space, best),
+        best_cost,
+        tuple(best_costs),
+        tuple(elite_costs),
+        num_rollouts,
+        non_finite,
+    )
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _ask(
+    encoding: Encoding,
+    population: int,
+    space: ActionSpace,
+    distribution: PyTree[Any],
+    key: PRNGKeyArray,
+) -> tuple[PyTree[Any], Actions]:
+    samples = encoding.sample(space, distribution, key, population)
+    return samples, encoding.decode(space, samples)
+
+
+@partial(jax.jit, static_argnums=0)
+def _tell(
+    encoding: Encoding,
+    space: ActionSpace,
+    distribution: PyTree[Any],
+    elites: PyTree[Any],
+    smoothing: float,
+) -> PyTree[Any]:
+    return encoding.update(space, distribution, elites, smoothing)
+
+
+def _rank_last(costs: Float[np.ndarray, " B"]) -> tuple[Float[np.ndarray, " B"], int]:
+    """Costs with infinity for those that are not finite, and how many those are."""
+    finite = np.isfinite(costs)
+    return np.where(finite, costs, np.inf), int(np.sum(~finite))
+
+
+def _take(samples: PyTree[Any], index: int | np.ndarray) -> PyTree[Any]:
+    return jax.tree.map(lambda array: np.asarray(array)[index], samples)
+
+
+def _prepend(sample: PyTree[Any], samples: PyTree[Any]) -> PyTree[Any]:
+    return jax.tree.map(lambda one, array: np.concatenate([one[None], array]), sample, samples)

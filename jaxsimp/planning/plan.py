@@ -1,0 +1,215 @@
+"""Planning: from a task and the particles that may be grasped to a plan, and its execution."""
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxsimp.dynamics import (
+    NONE,
+    Actions,
+    Pickers,
+    Simulation,
+    State,
+    at_rest,
+    make_pickers,
+    rollout,
+    settle,
+)
+from jaxsimp.planning.actions import ActionSpace, Encoding
+from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.population import Layout, PopulationMap, default_layout
+from jaxsimp.tasks import Episode, Task, score
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A plan and how it was found.
+
+    Attributes:
+        actions: shapes (T, G) and (T, G, 3), on the host.
+        search: costs by iteration and counts of rollouts.
+        seconds: that the search took, compilation not included.
+        compile_seconds: that compiling the draws and updates took, next to nothing where an
+            earlier plan has had the same candidates and encoding.
+    """
+
+    actions: Actions
+    search: Search
+    seconds: float
+    compile_seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Execution:
+    """What a plan does.
+
+    Attributes:
+        positions: at the start, after each action, and settled, shape (T + 2, N, 3), metres.
+        score: normalised score of the settled state.
+    """
+
+    positions: Float[np.ndarray, "T2 N 3"]
+    score: float
+
+
+class Planner:
+    """A task made ready to be planned for: its rollouts, compiled.
+
+    Attributes:
+        task: what is planned for.
+        config: settings of the search.
+        compile_seconds: that compiling the rollouts took.
+    """
+
+    def __init__(self, task: Task, config: CEMConfig, layout: Layout | None = None) -> None:
+        """Compile the task's rollouts for the population of `config`.
+
+        Args:
+            task: what is planned for.
+            config: settings of the search.
+            layout: of the population on this machine; by default the one measured to be best.
+        """
+        self.task, self.config = task, config
+        self._physics = task.simulation(), _pickers(task)
+        self._costs = PopulationMap(
+            partial(_plan_cost, task),
+            (self._physics, self._episode(task.episode_fn(0))),
+            self._idle(),
+            layout or default_layout(config.population),
+        )
+        self._execute = jax.jit(partial(_execute, task))
+        self.compile_seconds = self._costs.compile_seconds
+
+    def plan(
+        self,
+        episode: Episode,
+        candidates: Int[np.ndarray, " K"],
+        encoding: Encoding,
+        seed: int,
+        on_iteration: Callable[[], None] = lambda: None,
+    ) -> Plan:
+        """Search for a plan.
+
+        Args:
+            episode: start and goal.
+            candidates: ids of the particles that may be grasped, shape (K,).
+            encoding: of plans as samples of a distribution.
+            seed: of the random draws.
+            on_iteration: called after each iteration.
+        """
+        space = ActionSpace(
+            jnp.asarray(candidates),
+            jnp.asarray(self.task.limits, dtype=float),
+            self.task.num_actions,
+            self.task.num_pickers,
+        )
+        shared = (self._physics, self._episode(episode))
+        key = jax.random.key(seed)
+        start = time.perf_counter()
+        once = dataclasses.replace(self.config, num_iterations=1)
+        search(space, encoding, once, key, lambda actions: np.zeros(len(actions.pick)))
+        compiled = time.perf_counter()
+        costs = partial(self._costs, shared)
+        found = search(space, encoding, self.config, key, costs, on_iteration)
+        return Plan(
+            actions=jax.tree.map(np.asarray, found.actions),
+            search=found,
+            seconds=time.perf_counter() - compiled,
+            compile_seconds=compiled - start,
+        )
+
+    def estimate_seconds(self) -> float:
+        """Seconds that a plan takes, from one evaluation of a population that does nothing."""
+        shared = (self._physics, self._episode(self.task.episode_fn(0)))
+        start = time.perf_counter()
+        self._costs(shared, self._idle())
+        return (time.perf_counter() - start) * self.config.num_iterations
+
+    def execute(self, episode: Episode, actions: Actions) -> Execution:
+        """Carry out a plan, let the body settle, and score it."""
+        positions, value = self._execute(self._physics, self._episode(episode), actions)
+        return Execution(np.asarray(positions), float(value))
+
+    def _idle(self) -> Actions:
+        """A population of plans that grasp nothing."""
+        shape = (self.config.population, self.task.num_actions, self.task.num_pickers)
+        return Actions(np.full(shape, NONE, np.int32), np.zeros((*shape, 3), self._dtype))
+
+    def _episode(self, episode: Episode) -> Episode:
+        return jax.tree.map(lambda array: np.asarray(array, self._dtype), episode)
+
+    @property
+    def _dtype(self) -> np.dtype:
+        return np.dtype(jnp.result_type(float))
+
+
+def _pickers(task: Task) -> Pickers:
+    return make_pickers(task.limits, steps=task.action_steps)
+
+
+def _plan_cost(
+    task: Task, shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
+) -> Float[Array, ""]:
+    """Cost of a plan: the sum of the step costs over its actions (paper, IV-A).
+
+    The state that is left after the pickers let go is the last step.
+    """
+    (simulation, pickers), episode = shared
+
+    def step_cost(state: State) -> Float[Array, ""]:
+        return task.cost_fn(episode, state.position)
+
+    state, costs = rollout(simulation, pickers, at_rest(episode.start), actions, step_cost)
+    left = settle(simulation, state, task.release_steps)
+    return costs.sum() + step_cost(left)
+
+
+def _execute(
+    task: Task, physics: tuple[Simulation, Pickers], episode: Episode, actions: Actions
+) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""]]:
+    simulation, pickers = physics
+    start = at_rest(episode.start)
+    state, positions = rollout(simulation, pickers, start, actions)
+    final = settle(simulation, state, task.settle_steps).position
+    positions = jnp.concatenate([start.position[None], positions, final[None]])
+    return positions, score(task, episode, final)
+
+
+def save_plan(path: Path, actions: Actions, positions: Float[np.ndarray, "T2 N 3"]) -> None:
+    """Write a plan as `.npz`: it appears under its name whole or not at all.
+
+    Args:
+        path: of the file.
+        actions: the plan.
+        positions: of its execution, see `Execution`.
+    """
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        np.savez_compressed(
+            file, pick=actions.pick, displacement=actions.displacement, positions=positions
+        )
+    os.replace(part, path)
+
+
+def load_plan(path: Path) -> tuple[Actions, dict[str, Any]]:
+    """Read a plan written by `save_plan`: its actions, and all arrays by name.
+
+    Raises:
+        ValueError: if the file holds no plan.
+    """
+    with np.load(path) as file:
+        arrays = dict(file)
+    missing = {"pick", "displacement"} - arrays.keys()
+    if missing:
+        raise ValueError(f"{path} has no {', '.join(sorted(missing))}; it is not a saved plan")
+    return Actions(arrays["pick"], arrays["displacement"]), arrays

@@ -1,0 +1,146 @@
+"""How a population of rollouts is laid on this machine: the one place that decides it.
+
+On a CPU it is fastest to give every core its share of the population, and to run that share in
+chunks small enough for their state to stay in the cache, each through its whole rollout. On a
+GPU the whole population in one `vmap` is. See `Layout`.
+"""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A population split into one share a worker, each run in chunks of samples.
+
+    Attributes:
+        chunk_size: samples batched by `vmap`; the chunks of a share run one after another.
+        num_workers: host threads that run a share each; they take the devices in turn.
+
+    Raises:
+        ValueError: if a number is below 1.
+    """
+
+    chunk_size: int = 1
+    num_workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.chunk_size < 1 or self.num_workers < 1:
+            raise ValueError(
+                f"chunk_size is {self.chunk_size} and num_workers {self.num_workers}; "
+                f"both must be at least 1"
+            )
+
+
+CPU_CHUNK_SIZE = 8
+"""Samples a chunk on a CPU: measured best from 41 to 625 particles, by 1.6 to 4 times over 1."""
+
+
+def default_layout(population: int) -> Layout:
+    """The layout measured to be fastest: small chunks on every core, or one `vmap` a device."""
+    devices = jax.local_devices()
+    on_cpu = devices[0].platform == "cpu"
+    workers = max(_num_cores(), len(devices)) if on_cpu else len(devices)
+    share = -(-population // workers)
+    return Layout(chunk_size=min(CPU_CHUNK_SIZE, share) if on_cpu else share, num_workers=workers)
+
+
+def _num_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class PopulationMap:
+    """A function of one sample, compiled for a population of fixed size and layout.
+
+    The function is compiled for one share, so every sample runs through the same machine
+    code on whatever worker: results do not depend on how many there are.
+
+    Attributes:
+        compile_seconds: that compilation took.
+    """
+
+    def __init__(
+        self,
+        sample_fn: Callable[[Any, Any], Any],
+        shared: PyTree[Any],
+        batch: PyTree[Any],
+        layout: Layout,
+    ) -> None:
+        """Compile.
+
+        Args:
+            sample_fn: of `shared` and one sample; pure JAX.
+            shared: arguments common to all samples, as an example.
+            batch: a whole population, leading axis `B` on every leaf, as an example.
+            layout: how it is laid on the machine.
+        """
+        population = len(jax.tree.leaves(batch)[0])
+        self._layout, self._population = layout, population
+        self._share = _ceil_to(-(-population // layout.num_workers), layout.chunk_size)
+        devices = jax.local_devices()
+        self._devices = [devices[w % len(devices)] for w in range(layout.num_workers)]
+        self._pool = ThreadPoolExecutor(layout.num_workers)
+
+        def share_fn(shared: PyTree[Any], share: PyTree[Any]) -> PyTree[Any]:
+            one = lambda sample: sample_fn(shared, sample)
+            if layout.chunk_size == 1:
+                return jax.lax.map(one, share)
+            return jax.lax.map(one, share, batch_size=layout.chunk_size)
+
+        # Full-width vectors: worth 1.2 to 1.4 times the speed where the processor has them.
+        options = {"xla_cpu_prefer_vector_width": 512} if devices[0].platform == "cpu" else None
+        jitted = jax.jit(share_fn, compiler_options=options)
+        start = time.perf_counter()
+        share = self._shares(batch)[0]
+        self._compiled = {
+            device: jitted.lower(*jax.device_put((shared, share), device)).compile()
+            for device in dict.fromkeys(self._devices)
+        }
+        self.compile_seconds = time.perf_counter() - start
+
+    def __call__(self, shared: PyTree[Any], batch: PyTree[Any]) -> PyTree[np.ndarray]:
+        """The function's values on a population, leading axis `B`, on the host.
+
+        Raises:
+            ValueError: if there are more samples than were compiled for.
+        """
+        population = len(jax.tree.leaves(batch)[0])
+        if population > self._population:
+            raise ValueError(
+                f"the batch has {population} samples; the function was compiled for at most "
+                f"{self._population}"
+            )
+        results = self._pool.map(self._run, self._devices, [shared] * len(self._devices),
+                                 self._shares(batch))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[:population], *results)
+
+    def _run(self, device: jax.Device, shared: PyTree[Any], share: PyTree[Any]) -> PyTree[Any]:
+        return jax.device_get(self._compiled[device](*jax.device_put((shared, share), device)))
+
+    def _shares(self, batch: PyTree[Any]) -> Sequence[PyTree[Any]]:
+        """Equal shares, the last ones filled up with copies of the last sample."""
+        size, workers = self._share, self._layout.num_workers
+
+        def fill(array: Any) -> np.ndarray:
+            array = np.asarray(array)
+            padding = np.repeat(array[-1:], size * workers - len(array), axis=0)
+            return np.concatenate([array, padding])
+
+        filled = jax.tree.map(fill, batch)
+        return [
+            jax.tree.map(lambda array, w=w: array[w * size : (w + 1) * size], filled)
+            for w in range(workers)
+        ]
+
+
+def _ceil_to(count: int, multiple: int) -> int:
+    return -(-count // multiple) * multiple

@@ -1,0 +1,271 @@
+"""Batched convex quadratic programmes, and the backends that solve them.
+
+A problem is: minimise ½ x'Hx + g'x subject to A x = b and lower <= x <= upper. A batch holds
+B problems of one shape; what happens to one problem is reported as its status and never
+stops the others.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class Status(IntEnum):
+    """What became of one problem; `NOT_CONVERGED` includes problems without a lower bound."""
+
+    SOLVED = 0
+    INFEASIBLE = 1
+    NOT_CONVERGED = 2
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticProgram:
+    """A batch of B problems with n unknowns and m equality constraints.
+
+    Attributes:
+        H: symmetric positive semidefinite matrices, shape (B, n, n).
+        g: linear terms, shape (B, n).
+        A: equality constraints, shape (B, m, n), or None.
+        b: right-hand sides, shape (B, m), or None; given exactly when `A` is.
+        lower: lower bounds, shape (B, n), -inf where there is none, or None.
+        upper: upper bounds, shape (B, n), inf where there is none, or None.
+
+    Raises:
+        ValueError: if shapes disagree, a number is not a number, or an H is not convex.
+            Contradictory constraints are no error: their status is `INFEASIBLE`.
+    """
+
+    H: Float[np.ndarray, "B n n"]
+    g: Float[np.ndarray, "B n"]
+    A: Float[np.ndarray, "B m n"] | None = None
+    b: Float[np.ndarray, "B m"] | None = None
+    lower: Float[np.ndarray, "B n"] | None = None
+    upper: Float[np.ndarray, "B n"] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.A is None) != (self.b is None):
+            raise ValueError("one of A and b is missing; give both or neither")
+        _check_shapes(self)
+        _check_numbers(self)
+        _check_convex(self.H)
+
+    def __len__(self) -> int:
+        return len(self.g)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Minimisers of a batch.
+
+    Attributes:
+        x: minimisers, shape (B, n); NaN exactly in the rows that are not solved.
+        status: `Status` of each problem, shape (B,).
+    """
+
+    x: Float[np.ndarray, "B n"]
+    status: Int[np.ndarray, " B"]
+
+    @property
+    def solved(self) -> np.ndarray:
+        """True for the problems that are solved, shape (B,)."""
+        return self.status == Status.SOLVED
+
+
+def solve(problem: QuadraticProgram, backend: str = "proxsuite") -> Solution:
+    """Solve every problem of a batch.
+
+    Args:
+        problem: the batch.
+        backend: "closed_form" (JAX, without bounds), "proxsuite" (proximal augmented
+            Lagrangian, Bambade et al. 2022) or "qpsolvers" (the same algorithm, one problem
+            a call: a reference).
+
+    Raises:
+        ValueError: if there is no such backend, or it cannot handle the constraints.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend is {backend!r}; choose one of {', '.join(BACKENDS)}")
+    x, status = BACKENDS[backend](problem)
+    status = np.where(_crossed(problem), Status.INFEASIBLE, status)
+    return Solution(np.where((status == Status.SOLVED)[:, None], x, np.nan), status)
+
+
+def _closed_form(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
+    if problem.lower is not None or problem.upper is not None:
+        raise ValueError(
+            "the backend 'closed_form' has no box constraints; leave lower and upper out, "
+            "or use the backend 'proxsuite'"
+        )
+    size = problem.g.shape[1]
+    A = np.zeros((len(problem), 0, size)) if problem.A is None else problem.A
+    b = np.zeros((len(problem), 0)) if problem.b is None else problem.b
+    x, status = closed_form(*map(jnp.asarray, (problem.H, problem.g, A, b)))
+    return np.asarray(x), np.asarray(status)
+
+
+@jax.jit
+def closed_form(
+    H: Float[Array, "B n n"],
+    g: Float[Array, "B n"],
+    A: Float[Array, "B m n"],
+    b: Float[Array, "B m"],
+) -> tuple[Float[Array, "B n"], Int[Array, " B"]]:
+    """Minimisers without bounds, and their status, by the null-space method.
+
+    Solves the KKT conditions with pseudo-inverses (Nocedal & Wright, "Numerical
+    Optimization", section 16.2), so H may be singular and constraints may repeat each other.
+    Residuals of the conditions decide the status; a row that is not solved has no meaning.
+
+    Args:
+        H: symmetric positive semidefinite, shape (B, n, n).
+        g: shape (B, n).
+        A: shape (B, m, n); m = 0 for none.
+        b: shape (B, m).
+    """
+    return jax.vmap(_null_space_method)(H, g, A, b)
+
+
+def _null_space_method(H: Array, g: Array, A: Array, b: Array) -> tuple[Array, Array]:
+    tolerance = jnp.sqrt(jnp.finfo(H.dtype).eps)
+    tangent = jnp.eye(len(g), dtype=H.dtype)
+    start = jnp.zeros_like(g)
+    if len(b):
+        inverse = jnp.linalg.pinv(A)
+        tangent = tangent - inverse @ A
+        start = inverse @ b
+    reduced = jnp.linalg.pinv(tangent @ H @ tangent, hermitian=True)
+    x = start - tangent @ (reduced @ (tangent @ (H @ start + g)))
+    slope = jnp.linalg.norm(tangent @ (H @ x + g))
+    steep = slope > tolerance * (jnp.linalg.norm(H) * jnp.linalg.norm(x) + jnp.linalg.norm(g))
+    gap = jnp.linalg.norm(A @ x - b)
+    apart = gap > tolerance * (jnp.linalg.norm(A) * jnp.linalg.norm(x) + jnp.linalg.norm(b))
+    failed = steep | ~jnp.isfinite(x).all()
+    status = jnp.where(failed, int(Status.NOT_CONVERGED), int(Status.SOLVED))
+    return x, jnp.where(apart, int(Status.INFEASIBLE), status)
+
+
+def _proxsuite(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
+    from proxsuite import proxqp
+
+    size, num_equal = problem.g.shape[1], 0 if problem.b is None else problem.b.shape[1]
+    batch = proxqp.dense.VectorQP()
+    for H, g, A, b, lower, upper in _problems(problem):
+        qp = proxqp.dense.QP(size, num_equal, 0, True)
+        for name, value in PROXQP_SETTINGS.items():
+            setattr(qp.settings, name, value)
+        qp.init(H=H, g=g, A=A, b=b, l_box=lower, u_box=upper)
+        batch.append(qp)
+    proxqp.dense.solve_in_parallel(batch)
+    x = np.array([qp.results.x for qp in batch]).reshape(-1, size)
+    return x, _statuses([qp.results.info.status for qp in batch])
+
+
+def _qpsolvers(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
+    import qpsolvers
+
+    x, codes = np.zeros_like(problem.g), []
+    for index, (H, g, A, b, lower, upper) in enumerate(_problems(problem)):
+        one = qpsolvers.Problem(P=H, q=g, A=A, b=b, lb=lower, ub=upper)
+        solution = qpsolvers.solve_problem(one, "proxqp", **PROXQP_SETTINGS)
+        codes.append(solution.extras["info"].status)
+        if solution.found:
+            x[index] = solution.x
+    return x, _statuses(codes)
+
+
+def _statuses(codes: list) -> np.ndarray:
+    """Statuses of ProxQP as ours, shape (B,)."""
+    from proxsuite import proxqp
+
+    ours = {
+        proxqp.QPSolverOutput.PROXQP_SOLVED: Status.SOLVED,
+        proxqp.QPSolverOutput.PROXQP_PRIMAL_INFEASIBLE: Status.INFEASIBLE,
+    }
+    return np.array([ours.get(code, Status.NOT_CONVERGED) for code in codes], dtype=int)
+
+
+def _problems(problem: QuadraticProgram) -> Iterator[tuple]:
+    """H, g, A, b, lower and upper of each problem, in float64; bounds that cross are left out.
+
+    ProxQP iterates for seconds on bounds that cross, and does not call them infeasible.
+    """
+    infinite = np.full(problem.g.shape, np.inf)
+    crossed = _crossed(problem)[:, None]
+    lower = -infinite if problem.lower is None else np.where(crossed, -np.inf, problem.lower)
+    upper = infinite if problem.upper is None else np.where(crossed, np.inf, problem.upper)
+    for index in range(len(problem)):
+        arrays = (problem.H, problem.g, problem.A, problem.b, lower, upper)
+        yield tuple(None if each is None else each[index].astype(float) for each in arrays)
+
+
+def _crossed(problem: QuadraticProgram) -> np.ndarray:
+    """Problems whose bounds leave nothing between them, shape (B,)."""
+    lower = np.array(-np.inf) if problem.lower is None else problem.lower
+    upper = np.array(np.inf) if problem.upper is None else problem.upper
+    empty = (lower > upper) | (lower == np.inf) | (upper == -np.inf)
+    return np.any(np.broadcast_to(empty, problem.g.shape), axis=1)
+
+
+def _check_shapes(problem: QuadraticProgram) -> None:
+    batch, size = problem.g.shape
+    num_equal = 0 if problem.b is None else problem.b.shape[-1]
+    expected = {
+        "H": (batch, size, size),
+        "A": (batch, num_equal, size),
+        "b": (batch, num_equal),
+        "lower": (batch, size),
+        "upper": (batch, size),
+    }
+    for name, shape in expected.items():
+        array = getattr(problem, name)
+        if array is not None and array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}; {shape} is needed")
+
+
+def _check_numbers(problem: QuadraticProgram) -> None:
+    for name in ("H", "g", "A", "b", "lower", "upper"):
+        array = getattr(problem, name)
+        if array is None:
+            continue
+        wrong = np.isnan(array) if name in ("lower", "upper") else ~np.isfinite(array)
+        if wrong.any():
+            index = int(np.argwhere(wrong)[0, 0])
+            raise ValueError(f"{name} of problem {index} is not finite; give finite numbers")
+
+
+def _check_convex(H: np.ndarray) -> None:
+    tolerance = np.sqrt(np.finfo(H.dtype).eps) * np.abs(H).max(axis=(1, 2), initial=0.0)
+    skew = np.abs(H - np.swapaxes(H, 1, 2)).max(axis=(1, 2), initial=0.0) > tolerance
+    if skew.any():
+        raise ValueError(f"H of problem {skew.argmax()} is not symmetric; give (H + H') / 2")
+    least = np.linalg.eigvalsh(H).min(axis=1, initial=np.inf)
+    if (least < -tolerance).any():
+        index = int((least < -tolerance).argmax())
+        raise ValueError(
+            f"H of problem {index} has the eigenvalue {least[index]:g}; a convex problem has "
+            f"none below zero: give a positive semidefinite H"
+        )
+
+
+Backend = Callable[[QuadraticProgram], tuple[np.ndarray, np.ndarray]]
+BACKENDS: dict[str, Backend] = {
+    "closed_form": _closed_form,
+    "proxsuite": _proxsuite,
+    "qpsolvers": _qpsolvers,
+}
+# Absolute, since a residual of metres has a meaning; 1e-10 m is far below any goal's accuracy.
+# Without the duality gap ProxQP calls points solved that are 1e-6 off an active bound.
+PROXQP_SETTINGS: dict[str, Any] = {
+    "eps_abs": 1e-10,
+    "eps_rel": 0.0,
+    "check_duality_gap": True,
+    "eps_duality_gap_abs": 1e-9,
+    "eps_duality_gap_rel": 0.0,
+    "max_iter": 500,
+}

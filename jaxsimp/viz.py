@@ -1,0 +1,190 @@
+"""Pictures of bodies, models, searches and executed plans. matplotlib is imported when called."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsimp.body import Body
+from jaxsimp.simplify import KeyPoints
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+"""Distinct for the colour-blind (Okabe and Ito)."""
+GOAL_COLOR = "#999999"
+Positions = Float[np.ndarray, "N 3"]
+
+
+def plot_model_errors(models: Mapping[str, KeyPoints]) -> "Figure":
+    """Error of the simplified model by number of key points (Fig. 2 of the paper).
+
+    Args:
+        models: by the name of the task.
+    """
+    figure, panels = _panels(models)
+    for axes, (name, model) in zip(panels, models.items(), strict=True):
+        axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
+        axes.axhline(model.threshold * 1e3, color=GOAL_COLOR, ls="--", label="threshold")
+        axes.plot(model.sizes[-1], model.errors[-1] * 1e3, "o", ms=11, mfc="none", mec=COLORS[1],
+                  mew=2, label=f"chosen: {len(model)} key points")
+        axes.set(title=_title(name), xlabel="key points", ylabel="model error (mm)")
+        axes.set_xticks(np.arange(model.sizes[0], model.sizes[-1] + 1))
+        axes.set_xlim(model.sizes[0] - 0.5, model.sizes[-1] + 0.5)
+        axes.set_ylim(bottom=-0.05 * 1e3 * max(*model.errors, model.threshold))
+        axes.legend(frameon=False)
+    return figure
+
+
+def plot_models(models: Mapping[str, tuple[Body, Positions, KeyPoints]]) -> "Figure":
+    """Simplified models over their goals (Fig. 3 of the paper).
+
+    Args:
+        models: body, goal and key points by the name of the task.
+    """
+    figure, panels = _panels(models, three_d=True)
+    for axes, (name, (body, goal, model)) in zip(panels, models.items(), strict=True):
+        draw_body(axes, body, goal, GOAL_COLOR)
+        closed = model.elements[:, [*range(model.elements.shape[1]), 0]]
+        for element in closed if model.elements.shape[1] > 2 else model.elements:
+            axes.plot(*model.positions[element].T, color=COLORS[0], lw=1.5, zorder=5)
+        axes.scatter(*model.positions.T, color=COLORS[1], s=60, marker="*", zorder=6,
+                     depthshade=False)
+        _frame(axes, [goal])
+        axes.set_title(f"{_title(name)}: {len(model)} key points")
+    return figure
+
+
+def plot_costs(
+    costs: Mapping[str, Mapping[str, Float[np.ndarray, "R I"]]], ylabel: str = "cost of best plan"
+) -> "Figure":
+    """Cost by iteration, mean with a 95 % confidence interval over runs (Fig. 4 of the paper).
+
+    Args:
+        costs: for each task, for each method, one row a run, one column an iteration.
+        ylabel: what the cost is.
+    """
+    figure, panels = _panels(costs)
+    for axes, (name, methods) in zip(panels, costs.items(), strict=True):
+        for index, (method, runs) in enumerate(methods.items()):
+            iteration = np.arange(1, runs.shape[1] + 1)
+            mean, half = mean_interval(runs)
+            color, line = COLORS[index % len(COLORS)], ("-", "--")[index % 2]
+            axes.plot(iteration, mean, color=color, ls=line, label=method)
+            axes.fill_between(iteration, mean - half, mean + half, color=color, alpha=0.2, lw=0)
+        axes.set(title=_title(name), xlabel="iteration", ylabel=ylabel)
+        axes.set_ylim(bottom=0)
+        axes.margins(x=0.02)
+    panels[0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def mean_interval(
+    runs: Float[np.ndarray, "R I"],
+) -> tuple[Float[np.ndarray, " I"], Float[np.ndarray, " I"]]:
+    """Mean over runs and half the width of its 95 % confidence interval (Student's t)."""
+    from scipy import stats
+
+    mean, count = runs.mean(axis=0), len(runs)
+    if count < 2:
+        return mean, np.full_like(mean, np.nan)
+    return mean, stats.t.ppf(0.975, count - 1) * runs.std(axis=0, ddof=1) / np.sqrt(count)
+
+
+def plot_executions(
+    body: Body,
+    goal: Positions,
+    executions: Mapping[str, tuple[Float[np.ndarray, "P N 3"], float]],
+    title: str,
+) -> "Figure":
+    """Snapshots of executed plans beside their goal, a row a plan (Fig. 5 of the paper).
+
+    Args:
+        body: what moves.
+        goal: where it should end, metres.
+        executions: for each method the positions at the start, after each action, and
+            settled, and the score.
+        title: of the figure.
+    """
+    import matplotlib.pyplot as plt
+
+    columns = max(len(positions) for positions, _ in executions.values()) + 1
+    figure, grid = plt.subplots(
+        len(executions), columns, figsize=(2.2 * columns, 2.3 * len(executions) + 0.4),
+        squeeze=False, subplot_kw={"projection": "3d"}, layout="constrained",
+    )
+    every = [goal, *(frame for positions, _ in executions.values() for frame in positions)]
+    for row, (method, (positions, value)) in zip(grid, executions.items(), strict=True):
+        frames = [*positions, goal]
+        names = ["start", *(f"action {i}" for i in range(1, len(positions) - 1)),
+                 f"settled, score {value:.2f}", "goal"]
+        for axes, frame, name in zip(row, frames, names, strict=True):
+            draw_body(axes, body, frame, GOAL_COLOR if name == "goal" else COLORS[0])
+            _frame(axes, every)
+            axes.set_title(name, fontsize="small")
+        row[0].text2D(0.0, 1.12, method, transform=row[0].transAxes, weight="bold", fontsize="small")
+    figure.suptitle(_title(title))
+    return figure
+
+
+def draw_body(axes: "Axes", body: Body, positions: Positions, color: str) -> None:
+    """Draw a rope as a line, a surface as shaded triangles, into 3-D axes.
+
+    Args:
+        axes: of a 3-D projection.
+        body: what is drawn.
+        positions: shape (N, 3), metres.
+        color: of the body.
+    """
+    if len(body.faces):
+        axes.plot_trisurf(*positions.T, triangles=body.faces, color=color, alpha=0.55,
+                          edgecolor="none", antialiased=False, shade=True)
+        for edge in _outline(body):
+            axes.plot(*positions[edge].T, color="black", lw=0.6)
+    else:
+        axes.plot(*positions.T, color=color, lw=3, solid_capstyle="round")
+        axes.scatter(*positions[[0, -1]].T, color=color, s=25, depthshade=False)
+
+
+def _outline(body: Body) -> list[np.ndarray]:
+    """Particle ids along the four sides of a grid."""
+    grid = np.arange(body.num_particles).reshape(body.shape)
+    return [grid[0], grid[-1], grid[:, 0], grid[:, -1]]
+
+
+def _frame(axes: "Axes", shown: Sequence[Positions]) -> None:
+    """Equal scales around everything shown, seen from above at an angle, without axes."""
+    points = np.concatenate(shown)
+    low, high = points.min(axis=0), points.max(axis=0)
+    low[2], high[2] = 0.0, max(high[2], 1e-3)
+    span = np.maximum(high - low, 0.05 * np.ptp(points))
+    middle = (low + high) / 2
+    axes.set(xlim=(middle[0] - span[0] / 2, middle[0] + span[0] / 2),
+             ylim=(middle[1] - span[1] / 2, middle[1] + span[1] / 2),
+             zlim=(0, span[2]))
+    axes.set_box_aspect(span, zoom=1.25)
+    axes.view_init(elev=50, azim=-65)
+    axes.set_axis_off()
+
+
+def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Figure", list["Axes"]]:
+    """A figure of one panel an item, two a row."""
+    import matplotlib.pyplot as plt
+
+    columns = min(2, len(items))
+    rows = -(-len(items) // columns)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(4.6 * columns, 3.3 * rows), squeeze=False, layout="constrained",
+        subplot_kw={"projection": "3d"} if three_d else {},
+    )
+    panels = list(grid.ravel())
+    for unused in panels[len(items):]:
+        unused.remove()
+    return figure, panels[: len(items)]
+
+
+def _title(name: str) -> str:
+    return name.replace("_", " ")

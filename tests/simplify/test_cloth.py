@@ -1,0 +1,263 @@
+from functools import cache
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jaxsimp import body, goals
+from jaxsimp.simplify import simplify, simplify_cloth
+from jaxsimp.simplify.cloth import collapse_sequence, follow_creases
+from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
+
+HALF = 0.15
+CORNERS = [(-HALF, -HALF), (HALF, -HALF), (-HALF, HALF), (HALF, HALF)]
+ENDS = {"x": [(-HALF, 0), (HALF, 0)], "y": [(0, -HALF), (0, HALF)], "xy": []}
+SIDES = {(0, 1): "y", (0, -1): "y", (1, 0): "x", (-1, 0): "x"}
+DIAGONALS = dict.fromkeys([(1, 1), (-1, -1), (1, -1), (-1, 1)], "xy")
+FOLDS = {**SIDES, **DIAGONALS}
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@cache
+def cloth(count):
+    return body.cloth((count, count))
+
+
+def folded(count, direction, angle=0.0):
+    """The goal of a fold about the middle, the whole turned by `angle`."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.array([[cos, -sin], [sin, cos]]) @ np.array(direction, dtype=float)
+    return goals.fold(cloth(count), goals.flat(cloth(count), angle), np.zeros(2), turned)
+
+
+def assert_paper(points, count, direction):
+    """The paper's key points, each within a particle spacing of where it belongs."""
+    expected = np.array(CORNERS + ENDS[FOLDS[direction]])
+    assert len(points) == len(expected)
+    rest = cloth(count).rest[points.particles, :2]
+    distance = np.linalg.norm(rest[:, None] - expected, axis=2)
+    assert distance.min(axis=0).max() <= cloth(count).spacing * 1.001
+    assert distance.min(axis=1).max() <= cloth(count).spacing * 1.001
+
+
+def crumpled(rng, count=7):
+    """A goal that is a smooth, random deformation of the sheet."""
+    rest = cloth(count).rest
+    waves = sum(
+        np.outer(np.sin(rest @ rng.normal(scale=15, size=3) + rng.uniform(0, 6)), direction)
+        for direction in rng.normal(scale=0.02, size=(3, 3))
+    )
+    return goals.flat(cloth(count)) + waves
+
+
+@pytest.mark.parametrize("direction", [(0, 1), (1, 0), (1, 1), (1, -1)])
+def test_folds_of_the_paper_have_its_key_points(direction):
+    assert_paper(simplify_cloth(cloth(25), folded(25, direction)), 25, direction)
+
+
+@pytest.mark.parametrize("count", [12, 13])
+@pytest.mark.parametrize("direction", FOLDS)
+def test_other_meshes_have_the_same_key_points(count, direction):
+    assert_paper(simplify_cloth(cloth(count), folded(count, direction)), count, direction)
+
+
+@given(direction=st.sampled_from(list(FOLDS)), angle=st.floats(0, 2 * np.pi))
+@settings(max_examples=8)
+def test_a_turned_goal_has_the_same_key_points(direction, angle):
+    assert_paper(simplify_cloth(cloth(13), folded(13, direction, angle)), 13, direction)
+
+
+def test_a_flat_sheet_has_its_corners():
+    points = simplify_cloth(cloth(13), goals.flat(cloth(13), 0.4))
+    assert points.particles.tolist() == [0, 12, 156, 168]
+    assert points.errors[0] == pytest.approx(0.0, abs=1e-7)  # square root of 1e-14
+    assert points.threshold == pytest.approx(0.03)
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_key_points_are_particles_where_the_goal_has_them(seed):
+    goal = crumpled(np.random.default_rng(seed))
+    points = simplify_cloth(cloth(7), goal, threshold=0.04)
+    assert np.array_equal(points.positions, goal[points.particles])
+    assert (np.diff(points.particles) > 0).all()
+    assert np.array_equal(np.unique(points.elements), np.arange(len(points)))
+    assert points.sizes[-1] == len(points)
+    assert points.sizes == tuple(range(points.sizes[0], len(points) + 1))
+    assert points.errors[-1] < points.threshold <= min(points.errors[:-1], default=np.inf)
+    model = Surface(points.positions, points.elements)
+    original = Surface(goal, cloth(7).faces)
+    # Distances from the same samples, written with other vertex ids.
+    sampling = max(points.threshold / 10, cloth(7).spacing / 8)
+    measured = hausdorff_distance(original, model, sampling)
+    assert measured == pytest.approx(points.errors[-1], abs=1e-9)
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_every_mesh_on_the_way_is_a_disc(seed):
+    goal = crumpled(np.random.default_rng(seed))
+    meshes = collapse_sequence(goal, cloth(7).faces, max_size=30)
+    assert max(meshes) == 30
+    for size, faces in meshes.items():
+        used, compact = np.unique(faces, return_inverse=True)
+        mesh = trimesh.Trimesh(goal[used], compact.reshape(-1, 3), process=False)
+        assert len(used) == size
+        assert mesh.euler_number == 1  # a disc, and one piece
+        assert mesh.body_count == 1
+        assert mesh.is_winding_consistent
+        _, uses = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
+        assert uses.max() == 2  # manifold
+        assert np.linalg.norm(mesh.triangles_cross, axis=1).min() > 1e-6 * goal.var()
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_the_first_collapse_is_the_cheapest_by_brute_force(seed):
+    """Quadric errors from their definition: squared distances to the planes, one by one."""
+    rng = np.random.default_rng(seed)
+    sphere = trimesh.creation.icosphere(subdivisions=1)  # closed: no boundary to weigh
+    points = np.asarray(sphere.vertices) + rng.normal(scale=0.1, size=sphere.vertices.shape)
+    faces = np.asarray(sphere.faces)
+    meshes = collapse_sequence(points, faces, max_size=len(points))
+    (removed,) = set(range(len(points))) - set(np.unique(meshes[len(points) - 1]).tolist())
+    costs = {
+        (v, w): plane_error(points, faces, v, w)
+        for v in range(len(points))
+        for w in neighbours(faces, v)
+        if len(neighbours(faces, v) & neighbours(faces, w)) == 2
+        and not turns_over(points, faces, v, w)
+    }
+    cheapest = min(cost for (v, _), cost in costs.items() if v == removed)
+    assert cheapest <= min(costs.values()) * (1 + 1e-6)  # errors are rounded to 1e-16 of a whole
+
+
+def turns_over(points, faces, removed, kept):
+    """Whether a triangle that stays has an opposite normal after the collapse."""
+    for face in faces[(faces == removed).any(axis=1) & ~(faces == kept).any(axis=1)]:
+        a, b, c = points[face]
+        d, e, f = points[np.where(face == removed, kept, face)]
+        if np.cross(b - a, c - a) @ np.cross(e - d, f - d) < 0:
+            return True
+    return False
+
+
+def neighbours(faces, vertex):
+    return set(faces[(faces == vertex).any(axis=1)].ravel().tolist()) - {vertex}
+
+
+def plane_error(points, faces, removed, kept):
+    """Sum over both ends' triangles of area times squared distance of the kept end."""
+    total = 0.0
+    for end in (removed, kept):
+        for a, b, c in points[faces[(faces == end).any(axis=1)]]:
+            normal = np.cross(b - a, c - a)
+            area = np.linalg.norm(normal) / 2
+            total += area * ((points[kept] - a) @ normal / (2 * area)) ** 2
+    return total
+
+
+def test_the_sequence_is_deterministic_and_leaves_its_input_alone():
+    goal, faces = crumpled(np.random.default_rng(0)), cloth(7).faces
+    before = goal.copy()
+    first, second = (collapse_sequence(goal, faces, 10) for _ in range(2))
+    assert all(np.array_equal(first[size], second[size]) for size in first)
+    assert np.array_equal(goal, before)
+
+
+def test_a_motion_in_space_changes_nothing():
+    rng = np.random.default_rng(1)
+    goal = crumpled(rng)
+    turn = Rotation.random(rng=rng).as_matrix()
+    moved = goal @ turn.T + [3.0, -2.0, 5.0]
+    first, second = (simplify_cloth(cloth(7), g) for g in (goal, moved))
+    assert np.array_equal(first.particles, second.particles)
+    assert np.allclose(first.errors, second.errors, rtol=0.0, atol=2e-3)  # twice the bound
+
+
+def test_a_closed_surface_stays_closed():
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    meshes = collapse_sequence(np.asarray(sphere.vertices), np.asarray(sphere.faces), 40)
+    for faces in meshes.values():
+        model = trimesh.Trimesh(sphere.vertices, faces, process=False)
+        assert model.is_watertight
+        assert model.is_winding_consistent
+
+
+def test_a_hole_is_kept():
+    ring = cloth(7)
+    keep = ~np.isin(ring.faces, [24]).any(axis=1)
+    for faces in collapse_sequence(goals.flat(ring), ring.faces[keep], 20).values():
+        used, compact = np.unique(faces, return_inverse=True)
+        mesh = trimesh.Trimesh(ring.rest[used], compact.reshape(-1, 3), process=False)
+        assert mesh.euler_number == 0
+
+
+def test_triangles_follow_the_crease_they_would_cross():
+    count = 9
+    crossing = follow_creases(cloth(count), folded(count, (1, 1)))
+    edges = np.sort(crossing[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    crease = np.arange(count) * (count + 1)
+    along = np.stack([crease[:-1], crease[1:]], axis=1)
+    assert {tuple(e) for e in along.tolist()} <= {tuple(e) for e in edges.tolist()}
+    changed = (crossing != cloth(count).faces).any(axis=1)
+    assert changed.sum() == 2 * (count - 1)
+    # The sheet is covered as before, every triangle seen from the same side.
+    x, y = (
+        cloth(count).rest[crossing[:, k], :2] - cloth(count).rest[crossing[:, 0], :2]
+        for k in (1, 2)
+    )
+    areas = (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]) / 2
+    assert (areas > 0).all()
+    assert areas.sum() == pytest.approx(0.09)
+
+
+@pytest.mark.parametrize("direction", [(1, -1), (0, 1)])
+def test_triangles_that_follow_the_crease_are_left_alone(direction):
+    assert np.array_equal(follow_creases(cloth(9), folded(9, direction)), cloth(9).faces)
+
+
+def test_a_goal_in_one_line_or_point_does_not_fail():
+    line = goals.flat(cloth(5)) * [1, 0, 0]
+    with pytest.raises(ValueError, match="no mesh of up to 24 key points"):
+        simplify_cloth(cloth(5), line, threshold=1e-6)
+    point = np.zeros((25, 3))
+    with pytest.raises(ValueError, match="the mesh allows none"):
+        simplify_cloth(cloth(5), point)
+
+
+def test_no_fit_names_the_best_error_the_threshold_and_the_remedy():
+    goal = crumpled(np.random.default_rng(2))
+    message = r"up to 5 key points .* threshold of 1e-05 m: .* off by 0\.\d+ m; raise threshold"
+    with pytest.raises(ValueError, match=message):
+        simplify_cloth(cloth(7), goal, threshold=1e-5, max_size=5)
+
+
+def test_the_entry_takes_a_cloth():
+    points = simplify(cloth(13), folded(13, (0, 1)), max_size=8)
+    assert_paper(points, 13, (0, 1))
+    assert points.method == "quadric collapse"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"threshold": -1.0}, "threshold is -1; give a distance above zero"),
+        ({"max_size": 3}, "max_size is 3; at least 4"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        simplify_cloth(cloth(5), goals.flat(cloth(5)), **options)
+
+
+def test_bad_arguments_are_refused():
+    rope = body.rope()
+    with pytest.raises(ValueError, match="the rope has 0 triangles; give a surface"):
+        simplify_cloth(rope, goals.straight(rope))
+    with pytest.raises(ValueError, match=r"the goal has shape \(3, 3\); \(25, 3\)"):
+        simplify_cloth(cloth(5), np.zeros((3, 3)))

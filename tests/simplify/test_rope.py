@@ -1,0 +1,281 @@
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jaxsimp import body, goals
+from jaxsimp.simplify import simplify, simplify_rope
+from jaxsimp.simplify.qp import Status
+from jaxsimp.simplify.rope import (
+    breakpoint_particles,
+    fit_rope,
+    fit_rope_constrained,
+    interpolation_matrix,
+)
+
+ROPE = body.rope()  # 41 particles, 0.5 m
+SINGLE = 1e-6  # metres: float32 on coordinates below 1 m, and some room
+DOUBLE = 1e-12
+EXACT = 1e-7  # metres: ProxQP stops at residuals of 1e-10
+FREE = np.full(3, np.inf)
+
+seeds = st.integers(0, 2**32 - 1)
+SIZES = st.sampled_from([2, 3, 5, 8])  # few, since each is compiled
+
+
+def random_goals(rng, batch=3, count=41):
+    return np.cumsum(rng.normal(scale=0.01, size=(batch, count, 3)), axis=1)
+
+
+def corner_goal(rng, size, count):
+    """A rope with evenly spread random corners, shape (count, 3)."""
+    corners = rng.uniform(-0.5, 0.5, size=(size, 3))
+    along = np.linspace(0, size - 1, count)
+    return np.stack([np.interp(along, np.arange(size), axis) for axis in corners.T], 1), corners
+
+
+@pytest.mark.usefixtures("x64")
+@given(seed=seeds, size=SIZES)
+def test_fit_matches_numpy_least_squares(seed, size):
+    goal = random_goals(np.random.default_rng(seed))
+    positions, errors = fit_rope(goal, size)
+    for p, q, error in zip(goal, positions, errors, strict=True):
+        expected, *_ = np.linalg.lstsq(interpolation_matrix(41, size), p, rcond=None)
+        squared = np.sum((interpolation_matrix(41, size) @ expected - p) ** 2)  # equation 3
+        assert np.asarray(q) == pytest.approx(expected, abs=DOUBLE)
+        assert float(error) == pytest.approx(np.sqrt(squared / 41), abs=DOUBLE)
+
+
+@pytest.mark.parametrize(("count", "size"), [(41, 2), (41, 7), (10, 10), (11, 10), (2, 2)])
+def test_interpolation_matrix_matches_numpy_interp(count, size):
+    along, knots = np.linspace(0, 1, count), np.linspace(0, 1, size)
+    expected = np.stack([np.interp(along, knots, row) for row in np.eye(size)], axis=1)
+    W = interpolation_matrix(count, size)
+    assert np.allclose(W, expected, rtol=0.0, atol=1e-14)  # rounding
+    assert np.linalg.matrix_rank(W) == size  # the fit is unique
+
+
+@given(seed=seeds, size=SIZES, count=st.sampled_from([9, 41]))
+def test_evenly_spread_corners_are_fitted_exactly(seed, size, count):
+    goal, corners = corner_goal(np.random.default_rng(seed), size, count)
+    positions, errors = fit_rope(goal[None], size)
+    # With nearly as many corners as particles some are held by few: rounding grows.
+    assert np.asarray(positions[0]) == pytest.approx(corners, abs=20 * SINGLE)
+    assert float(errors[0]) <= SINGLE
+
+
+@given(seed=seeds, size=SIZES)
+def test_error_does_not_change_when_the_goal_moves(seed, size):
+    rng = np.random.default_rng(seed)
+    goal = random_goals(rng, batch=1)
+    moved = goal @ Rotation.random(rng=rng).as_matrix().T + rng.normal(size=3)
+    errors = [float(fit_rope(g, size)[1][0]) for g in (goal, moved)]
+    assert errors[1] == pytest.approx(errors[0], abs=SINGLE)
+
+
+@given(seed=seeds, size=SIZES)
+def test_a_batch_is_its_goals_one_by_one(seed, size):
+    batch = random_goals(np.random.default_rng(seed))
+    positions, errors = fit_rope(batch, size)
+    for index, goal in enumerate(batch):
+        alone, error = fit_rope(goal[None], size)
+        assert np.asarray(alone[0]) == pytest.approx(np.asarray(positions[index]), abs=SINGLE)
+        assert float(error[0]) == pytest.approx(float(errors[index]), abs=SINGLE)
+
+
+def test_fit_commutes_with_vmap_and_keeps_the_dtype():
+    batch = random_goals(np.random.default_rng(0)).astype(np.float32)
+    positions, _ = fit_rope(batch, 4)
+    mapped = jax.vmap(lambda goal: fit_rope(goal[None], 4)[0][0])(batch)
+    assert np.asarray(mapped) == pytest.approx(np.asarray(positions), abs=SINGLE)
+    assert positions.dtype == np.float32
+    with jax.enable_x64(True):
+        assert fit_rope(batch.astype(float), 4)[0].dtype == np.float64
+
+
+@given(seed=seeds, size=SIZES)
+def test_constraints_are_satisfied_and_cost_something(seed, size):
+    rng = np.random.default_rng(seed)
+    batch = random_goals(rng)
+    lower, upper = np.array([-0.02, -np.inf, 0.004]), np.array([0.02, 0.03, np.inf])
+    positions, errors, status = fit_rope_constrained(batch, size, lower, upper)
+    assert (status == Status.SOLVED).all()
+    assert (positions >= lower - EXACT).all()
+    assert (positions <= upper + EXACT).all()
+    _, free = fit_rope(batch, size)
+    assert (errors >= np.asarray(free) - SINGLE).all()
+    fitted = interpolation_matrix(41, size) @ positions
+    assert errors == pytest.approx(
+        np.sqrt(np.sum((fitted - batch) ** 2, axis=(1, 2)) / 41), abs=EXACT
+    )
+    # No nearby point of the box is better: the programme is convex, so none is.
+    for _ in range(20):
+        other = np.clip(positions + rng.normal(scale=1e-3, size=positions.shape), lower, upper)
+        other_fit = interpolation_matrix(41, size) @ other
+        assert (np.sum((other_fit - batch) ** 2, axis=(1, 2)) >= errors**2 * 41 - EXACT).all()
+
+
+@pytest.mark.parametrize("backend", ["closed_form", "proxsuite", "qpsolvers"])
+@pytest.mark.usefixtures("x64")
+def test_fixed_ends_are_kept_and_backends_agree(backend):
+    batch = random_goals(np.random.default_rng(1))
+    positions, errors, status = fit_rope_constrained(
+        batch, 5, -FREE, FREE, fixed_ends=True, backend=backend
+    )
+    assert (status == Status.SOLVED).all()
+    assert positions[:, [0, -1]] == pytest.approx(batch[:, [0, -1]], abs=EXACT)
+    # Oracle: least squares for the inner breakpoints, the ends' share taken off.
+    W = interpolation_matrix(41, 5)
+    for goal, q, error in zip(batch, positions, errors, strict=True):
+        rest = goal - W[:, [0, -1]] @ goal[[0, -1]]
+        inner, *_ = np.linalg.lstsq(W[:, 1:-1], rest, rcond=None)
+        assert q[1:-1] == pytest.approx(inner, abs=EXACT)
+        expected = np.sqrt(np.sum((W[:, 1:-1] @ inner - rest) ** 2) / 41)
+        assert error == pytest.approx(expected, abs=EXACT)
+
+
+def test_without_constraints_the_programme_is_the_closed_form():
+    batch = random_goals(np.random.default_rng(2))
+    positions, errors, _ = fit_rope_constrained(batch, 6, -FREE, FREE)
+    expected, expected_errors = fit_rope(batch, 6)
+    assert positions == pytest.approx(np.asarray(expected), abs=SINGLE)
+    assert errors == pytest.approx(np.asarray(expected_errors), abs=SINGLE)
+
+
+def test_an_infeasible_goal_is_a_status_and_leaves_the_others_alone():
+    batch = random_goals(np.random.default_rng(3)) * [1, 1, 0.01] + [0, 0, 0.1]
+    batch[1, 0, 2] = -0.05  # an end below the table
+    lower = np.array([-np.inf, -np.inf, 0.004])
+    positions, errors, status = fit_rope_constrained(batch, 4, lower, FREE, fixed_ends=True)
+    assert status.tolist() == [Status.SOLVED, Status.INFEASIBLE, Status.SOLVED]
+    assert np.isnan(positions[1]).all()
+    assert errors[1] == np.inf
+    alone, *_ = fit_rope_constrained(batch[2:], 4, lower, FREE, fixed_ends=True)
+    assert positions[2] == pytest.approx(alone[0], abs=EXACT)
+
+
+def test_a_straight_rope_needs_its_ends():
+    points = simplify_rope(ROPE, goals.straight(ROPE))
+    assert points.particles.tolist() == [0, 40]
+    assert points.elements.tolist() == [[0, 1]]
+    assert points.positions == pytest.approx(goals.straight(ROPE)[[0, 40]], abs=SINGLE)
+    assert points.threshold == pytest.approx(0.015 * 0.5)
+
+
+@pytest.mark.parametrize(
+    ("corners", "particles"),
+    [
+        ([[0, 0], [0.25, 0], [0.125, 0.2165]], [0, 20, 40]),  # the paper's fold, of two legs
+        ([[0, 0], [1, 1], [2, 0], [3, 1], [4, 0]], [0, 10, 20, 30, 40]),  # M
+        ([[0, 0], [1, 0], [0.5, 0.8660254], [0, 0]], [0, 13, 27, 40]),  # triangle
+    ],
+)
+def test_polylines_of_equal_legs_give_their_corners(corners, particles):
+    corners = np.array(corners, dtype=float)
+    corners *= 0.5 / np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
+    goal = goals.polyline(ROPE, corners)
+    points = simplify_rope(ROPE, goal)
+    assert points.particles.tolist() == particles
+    assert points.sizes == tuple(range(2, len(particles) + 1))
+    assert points.positions[:, :2] == pytest.approx(corners, abs=10 * SINGLE)
+    assert points.errors[-1] < points.threshold <= min(points.errors[:-1])
+
+
+def test_every_size_is_tried_since_errors_are_not_monotone():
+    goal = goals.polyline(ROPE, np.array([[0, 0], [0.25, 0], [0.25, 0.25]]))
+    errors = [float(fit_rope(goal[None], size)[1][0]) for size in (3, 4, 5)]
+    assert errors[0] < SINGLE
+    assert errors[2] < SINGLE
+    assert errors[1] > 1e-3
+    points = simplify_rope(ROPE, goal, threshold=1e-4)
+    assert points.sizes == (2, 3)
+
+
+def test_far_from_the_origin_float32_is_as_good():
+    goal = goals.polyline(ROPE, np.array([[0, 0], [0.25, 0], [0.25, 0.25]]))
+    goal = goal + np.array([1e4, -1e4, 0])
+    points = simplify_rope(ROPE, goal, threshold=1e-5)  # float32 at 1e4 m steps by 1e-3 m
+    assert len(points) == 3
+
+
+@pytest.mark.parametrize(("count", "size"), [(41, 4), (41, 6), (10, 4), (7, 7), (1000, 20)])
+def test_key_particles_are_the_nearest_by_id(count, size):
+    ids = breakpoint_particles(count, size)
+    exact = np.linspace(0, count - 1, size)
+    assert ids[0] == 0
+    assert ids[-1] == count - 1
+    assert (np.diff(ids) > 0).all()
+    assert np.abs(ids - exact).max() <= 0.5 + 1e-9
+
+
+def test_constraints_reach_the_key_points():
+    goal = goals.straight(ROPE)
+    goal[:, 2] -= 0.01
+    low = simplify_rope(ROPE, goal, threshold=0.02)
+    high = simplify_rope(ROPE, goal, threshold=0.02, above_table=True)
+    assert low.positions[:, 2].max() < 0
+    assert high.positions[:, 2] == pytest.approx(ROPE.radius, abs=EXACT)
+    workspace = np.array([[-0.24, -1, -1], [0.24, 1, 1]])
+    boxed = simplify_rope(ROPE, goal, threshold=0.02, workspace=workspace)
+    assert np.abs(boxed.positions[:, 0]).max() <= 0.24 + EXACT
+    bent = goals.polyline(ROPE, np.array([[0, 0], [0.3, 0], [0.3, 0.2]]))
+    fixed = simplify_rope(ROPE, bent, fixed_ends=True)
+    assert fixed.positions[[0, -1]] == pytest.approx(bent[[0, -1]], abs=EXACT)
+
+
+def test_contradictory_constraints_are_refused_with_a_remedy():
+    goal = goals.straight(ROPE)
+    goal[0, 2] = -0.1
+    with pytest.raises(ValueError, match=r"INFEASIBLE; widen the workspace"):
+        simplify_rope(ROPE, goal, above_table=True, fixed_ends=True)
+
+
+def test_no_fit_names_the_best_error_the_threshold_and_the_remedy():
+    goal = random_goals(np.random.default_rng(4), batch=1)[0]
+    message = r"up to 3 key points .* threshold of 1e-09 m: .* off by 0\.\d+ m; raise threshold"
+    with pytest.raises(ValueError, match=message):
+        simplify_rope(ROPE, goal, threshold=1e-9, max_size=3)
+
+
+def test_more_key_points_than_particles_are_never_tried():
+    small = body.rope(num_particles=4, length=0.3)
+    goal = np.random.default_rng(5).normal(size=(4, 3))
+    points = simplify_rope(small, goal, threshold=1e-3, max_size=50)
+    assert points.particles.tolist() == [0, 1, 2, 3]
+
+
+def test_the_entry_takes_a_rope():
+    goal = goals.straight(ROPE)
+    assert simplify(ROPE, goal).particles.tolist() == [0, 40]
+    assert simplify(ROPE, goal, threshold=0.1, max_size=2).threshold == 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"threshold": 0.0}, "threshold is 0; give a distance above zero"),
+        ({"threshold": float("nan")}, "threshold is nan"),
+        ({"max_size": 1}, "max_size is 1; at least 2"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        simplify_rope(ROPE, goals.straight(ROPE), **options)
+
+
+def test_bad_arguments_are_refused():
+    cloth = body.cloth((3, 3))
+    with pytest.raises(ValueError, match=r"8 triangles; give a rope, or use simplify_cloth"):
+        simplify_rope(cloth, goals.flat(cloth))
+    goal = goals.straight(ROPE)
+    goal[7] = np.nan
+    with pytest.raises(ValueError, match=r"particle 7 is .* finite"):
+        simplify(ROPE, goal)
+    with pytest.raises(ValueError, match=r"the goal has shape \(40, 3\)"):
+        simplify(ROPE, goals.straight(ROPE)[:40])
+    with pytest.raises(ValueError, match="method is 'best'; choose one of paper"):
+        simplify(ROPE, goals.straight(ROPE), method="best")
+    with pytest.raises(ValueError, match="size is 42; a rope of 41 particles has 2 to 41"):
+        interpolation_matrix(41, 42)
