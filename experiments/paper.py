@@ -235,7 +235,7 @@ def _row_config(task: Task, config: CEMConfig) -> dict[str, Any]:
         "limits": list(task.limits),
         "time_step": task.time_step,
         "action_steps": task.action_steps,
-        "settle_steps": task.settle_steps,
+        "settle_actions": task.settle_actions,
         "layout": dataclasses.asdict(layout),
     }
 

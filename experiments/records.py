@@ -24,7 +24,7 @@ def environment() -> dict[str, Any]:
     device = jax.devices()[0]
     return {
         "python": platform.python_version(),
-        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+        "versions": {name: _version(name) for name in PACKAGES},
         "commit": _commit(),
         "platform": platform.platform(),
         "processor": _processor(),
@@ -100,6 +100,13 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         with path.open("r+") as file:
             file.truncate(len((whole + newline).encode()))
     return [json.loads(line) for line in whole.splitlines()]
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _commit() -> str:

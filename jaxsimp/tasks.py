@@ -19,6 +19,7 @@ from jaxsimp.body import Body, cloth, rope
 from jaxsimp.dynamics import (
     Actions,
     Simulation,
+    State,
     at_rest,
     largest_time_step,
     make_pickers,
@@ -51,8 +52,8 @@ class Task:
         num_actions: actions in a plan, `T`.
         num_pickers: `G`.
         action_seconds: that one action takes.
-        release_seconds: after the last action until the last step cost of a search.
-        settle_seconds: after the last action until the plan is scored.
+        settle_actions: as many times `action_seconds` pass, with nothing held, after the
+            last action and before the plan is scored.
         longest_time_step: bound on the time step of the simulation, seconds.
     """
 
@@ -65,8 +66,7 @@ class Task:
     num_actions: int = 4
     num_pickers: int = 2
     action_seconds: float = 0.3
-    release_seconds: float = 0.3
-    settle_seconds: float = 1.0
+    settle_actions: int = 4
     longest_time_step: float = 2e-3
 
     def __post_init__(self) -> None:
@@ -85,16 +85,6 @@ class Task:
     def action_steps(self) -> int:
         """Time steps of one action."""
         return round(self.action_seconds / self.time_step)
-
-    @property
-    def release_steps(self) -> int:
-        """Time steps after the last action in a search."""
-        return round(self.release_seconds / self.time_step)
-
-    @property
-    def settle_steps(self) -> int:
-        """Time steps after the last action before the score."""
-        return round(self.settle_seconds / self.time_step)
 
 
 def score(
@@ -247,12 +237,12 @@ def _drop(body: Body) -> Callable[[Actions], Float[Array, "N 3"]]:
 
     @jax.jit
     def drop(actions: Actions) -> Float[Array, "N 3"]:
-        state = at_rest(goals.flat(body))
-        for index in range(4):
-            one = jax.tree.map(lambda array, i=index: array[i : i + 1], actions)
-            state, _ = rollout(simulation, pickers, state, one)
-            state = settle(simulation, state, settle_steps)
-        return state.position
+        def one(state: State, action: Actions) -> tuple[State, None]:
+            single = jax.tree.map(lambda array: array[None], action)
+            state, _ = rollout(simulation, pickers, state, single)
+            return settle(simulation, state, settle_steps), None
+
+        return jax.lax.scan(one, at_rest(goals.flat(body)), actions)[0].position
 
     return drop
 

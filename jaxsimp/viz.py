@@ -53,7 +53,7 @@ def plot_models(models: Mapping[str, tuple[Body, Positions, KeyPoints]]) -> "Fig
             axes.plot(*model.positions[element].T, color=COLORS[0], lw=1.5, zorder=5)
         axes.scatter(*model.positions.T, color=COLORS[1], s=60, marker="*", zorder=6,
                      depthshade=False)
-        _frame(axes, [goal])
+        _frame(axes, [goal], zoom=0.95)
         axes.set_title(f"{_title(name)}: {len(model)} key points")
     return figure
 
@@ -74,9 +74,10 @@ def plot_costs(
             mean, half = mean_interval(runs)
             color, line = COLORS[index % len(COLORS)], ("-", "--")[index % 2]
             axes.plot(iteration, mean, color=color, ls=line, label=method)
-            axes.fill_between(iteration, mean - half, mean + half, color=color, alpha=0.2, lw=0)
+            axes.fill_between(iteration, mean - half, mean + half, color=color, alpha=0.15, lw=0)
         axes.set(title=_title(name), xlabel="iteration", ylabel=ylabel)
-        axes.set_ylim(bottom=0)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.set_ylim(0, 1.15 * max(np.nanmax(runs.mean(axis=0)) for runs in methods.values()))
         axes.margins(x=0.02)
     panels[0].legend(frameon=False, fontsize="small")
     return figure
@@ -155,7 +156,7 @@ def _outline(body: Body) -> list[np.ndarray]:
     return [grid[0], grid[-1], grid[:, 0], grid[:, -1]]
 
 
-def _frame(axes: "Axes", shown: Sequence[Positions]) -> None:
+def _frame(axes: "Axes", shown: Sequence[Positions], zoom: float = 1.25) -> None:
     """Equal scales around everything shown, seen from above at an angle, without axes."""
     points = np.concatenate(shown)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -165,7 +166,7 @@ def _frame(axes: "Axes", shown: Sequence[Positions]) -> None:
     axes.set(xlim=(middle[0] - span[0] / 2, middle[0] + span[0] / 2),
              ylim=(middle[1] - span[1] / 2, middle[1] + span[1] / 2),
              zlim=(0, span[2]))
-    axes.set_box_aspect(span, zoom=1.25)
+    axes.set_box_aspect(span, zoom=zoom)
     axes.view_init(elev=50, azim=-65)
     axes.set_axis_off()
 

@@ -111,7 +111,7 @@ class GaussianIndex:
     def init(self, space: ActionSpace, spread: float) -> Gaussian:
         """Mean 0, the given deviation in all four coordinates."""
         shape = (space.num_actions, space.num_pickers, 4)
-        return Gaussian(jnp.zeros(shape), jnp.full(shape, spread))
+        return _centred(shape, spread)
 
     def sample(
         self, space: ActionSpace, distribution: Gaussian, key: PRNGKeyArray, num: int
@@ -167,8 +167,8 @@ class Categorical:
         shape = (space.num_actions, space.num_pickers)
         choices = len(space.candidates) + 1
         return ChoiceAndGaussian(
-            jnp.full((*shape, choices), 1.0 / choices),
-            Gaussian(jnp.zeros((*shape, 3)), jnp.full((*shape, 3), spread)),
+            jnp.full((*shape, choices), 1.0 / choices, dtype=float),
+            _centred((*shape, 3), spread),
         )
 
     def sample(
@@ -208,6 +208,11 @@ class Categorical:
     ) -> tuple[Int[Array, "T G"], Float[Array, "T G 3"]]:
         """The likeliest choices with the mean displacements."""
         return distribution.frequency.argmax(axis=-1), distribution.displacement.mean
+
+
+def _centred(shape: tuple[int, ...], spread: float) -> Gaussian:
+    # With a dtype, or the first update would compile for one type and the next for another.
+    return Gaussian(jnp.zeros(shape, dtype=float), jnp.full(shape, spread, dtype=float))
 
 
 def _blend(old: Array, new: Array, smoothing: float) -> Array:

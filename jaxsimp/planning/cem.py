@@ -108,33 +108,35 @@ def search(
         on_iteration: called after each iteration.
     """
     distribution = encoding.init(space, config.initial_spread)
-    best, best_cost = None, np.inf
+    best: _Pool | None = None
     best_costs, elite_costs, non_finite = [], [], 0
-    for key_iteration in jax.random.split(key, config.num_iterations):
-        samples, actions = _ask(encoding, config.population, space, distribution, key_iteration)
+    for iteration in range(config.num_iterations):
+        samples, actions = _ask(
+            encoding, config.population, space, distribution, jax.random.fold_in(key, iteration)
+        )
         costs, failed = _rank_last(evaluate_fn(actions))
         non_finite += failed
+        pool = _Pool(samples, actions, costs)
         if config.keep_best and best is not None:
-            samples, costs = _prepend(best, samples), np.append(best_cost, costs)
-        order = np.argsort(costs, kind="stable")[: config.num_elites]
-        if best is None or costs[order[0]] < best_cost:
-            best, best_cost = _take(samples, order[0]), float(costs[order[0]])
-        elites = _take(samples, order)
-        distribution = _tell(encoding, space, distribution, elites, config.smoothing)
-        best_costs.append(best_cost)
-        elite_costs.append(float(costs[order].mean()))
+            pool = best.joined_by(pool)
+        elites = pool.take(np.argsort(pool.costs, kind="stable")[: config.num_elites])
+        if best is None or elites.costs[0] < best.costs[0]:
+            best = elites.take(slice(0, 1))
+        distribution = _tell(encoding, space, distribution, elites.samples, config.smoothing)
+        best_costs.append(float(best.costs[0]))
+        elite_costs.append(float(elites.costs.mean()))
         on_iteration()
     num_rollouts = config.num_iterations * config.population
     if config.returns == "mean":
-        best = encoding.mean(space, distribution)
-        one = jax.tree.map(lambda array: array[None], encoding.decode(space, best))
-        costs, failed = _rank_last(evaluate_fn(one))
-        best_cost = float(costs[0])
+        actions = encoding.decode(space, encoding.mean(space, distribution))
+        actions = jax.tree.map(lambda array: array[None], actions)
+        costs, failed = _rank_last(evaluate_fn(actions))
+        best = _Pool((), actions, costs)
         non_finite += failed
         num_rollouts += 1
     return Search(
-        encoding.decode(space, best),
-        best_cost,
+        jax.tree.map(lambda array: array[0], best.actions),
+        float(best.costs[0]),
         tuple(best_costs),
         tuple(elite_costs),
         num_rollouts,
@@ -142,7 +144,31 @@ def search(
     )
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@dataclass(frozen=True)
+class _Pool:
+    """Samples, the plans that they mean and their costs, leading axis `B`."""
+
+    samples: PyTree[Any]
+    actions: Actions
+    costs: Float[np.ndarray, " B"]
+
+    def take(self, index: np.ndarray | slice) -> "_Pool":
+        return self._map(lambda array: np.asarray(array)[index])
+
+    def joined_by(self, other: "_Pool") -> "_Pool":
+        return self._map(lambda *arrays: np.concatenate(arrays), other)
+
+    def _map(self, fn: Callable[..., np.ndarray], *others: "_Pool") -> "_Pool":
+        pools = (self, *others)
+        plans = [(pool.samples, pool.actions) for pool in pools]
+        samples, actions = jax.tree.map(lambda *arrays: jnp.asarray(fn(*arrays)), *plans)
+        return _Pool(samples, actions, fn(*(pool.costs for pool in pools)))
+
+
+# Random bits compile five times as fast unoptimised, and a round draws them once.
+@partial(
+    jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0}
+)
 def _ask(
     encoding: Encoding,
     population: int,
@@ -154,7 +180,7 @@ def _ask(
     return samples, encoding.decode(space, samples)
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(jax.jit, static_argnums=(0, 4))
 def _tell(
     encoding: Encoding,
     space: ActionSpace,
@@ -169,11 +195,3 @@ def _rank_last(costs: Float[np.ndarray, " B"]) -> tuple[Float[np.ndarray, " B"],
     """Costs with infinity for those that are not finite, and how many those are."""
     finite = np.isfinite(costs)
     return np.where(finite, costs, np.inf), int(np.sum(~finite))
-
-
-def _take(samples: PyTree[Any], index: int | np.ndarray) -> PyTree[Any]:
-    return jax.tree.map(lambda array: np.asarray(array)[index], samples)
-
-
-def _prepend(sample: PyTree[Any], samples: PyTree[Any]) -> PyTree[Any]:
-    return jax.tree.map(lambda one, array: np.concatenate([one[None], array]), sample, samples)

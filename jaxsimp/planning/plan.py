@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import time
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +25,6 @@ from jaxsimp.dynamics import (
     at_rest,
     make_pickers,
     rollout,
-    settle,
 )
 from jaxsimp.planning.actions import ActionSpace, Encoding
 from jaxsimp.planning.cem import CEMConfig, Search, search
@@ -36,7 +37,7 @@ class Plan:
     """A plan and how it was found.
 
     Attributes:
-        actions: shapes (T, G) and (T, G, 3), on the host.
+        actions: shapes (T, G) and (T, G, 3).
         search: costs by iteration and counts of rollouts.
         seconds: that the search took, compilation not included.
         compile_seconds: that compiling the draws and updates took, next to nothing where an
@@ -81,14 +82,12 @@ class Planner:
         """
         self.task, self.config = task, config
         self._physics = task.simulation(), _pickers(task)
-        self._costs = PopulationMap(
-            partial(_plan_cost, task),
-            (self._physics, self._episode(task.episode_fn(0))),
-            self._idle(),
-            layout or default_layout(config.population),
-        )
-        self._execute = jax.jit(partial(_execute, task))
-        self.compile_seconds = self._costs.compile_seconds
+        shared = (self._physics, self._episode(task.episode_fn(0)))
+        layout = layout or default_layout(config.population)
+        one = jax.tree.map(lambda array: array[:1], self._idle())
+        self._costs = PopulationMap(partial(_plan_cost, task), shared, self._idle(), layout)
+        self._execution = PopulationMap(partial(_execute, task), shared, one, Layout())
+        self.compile_seconds = self._costs.compile_seconds + self._execution.compile_seconds
 
     def plan(
         self,
@@ -122,7 +121,7 @@ class Planner:
         costs = partial(self._costs, shared)
         found = search(space, encoding, self.config, key, costs, on_iteration)
         return Plan(
-            actions=jax.tree.map(np.asarray, found.actions),
+            actions=found.actions,
             search=found,
             seconds=time.perf_counter() - compiled,
             compile_seconds=compiled - start,
@@ -137,13 +136,15 @@ class Planner:
 
     def execute(self, episode: Episode, actions: Actions) -> Execution:
         """Carry out a plan, let the body settle, and score it."""
-        positions, value = self._execute(self._physics, self._episode(episode), actions)
-        return Execution(np.asarray(positions), float(value))
+        shared = (self._physics, self._episode(episode))
+        one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
+        (positions,), (value,) = self._execution(shared, one)
+        return Execution(positions, float(value))
 
     def _idle(self) -> Actions:
         """A population of plans that grasp nothing."""
         shape = (self.config.population, self.task.num_actions, self.task.num_pickers)
-        return Actions(np.full(shape, NONE, np.int32), np.zeros((*shape, 3), self._dtype))
+        return Actions(jnp.full(shape, NONE), jnp.zeros((*shape, 3), self._dtype))
 
     def _episode(self, episode: Episode) -> Episode:
         return jax.tree.map(lambda array: np.asarray(array, self._dtype), episode)
@@ -162,27 +163,38 @@ def _plan_cost(
 ) -> Float[Array, ""]:
     """Cost of a plan: the sum of the step costs over its actions (paper, IV-A).
 
-    The state that is left after the pickers let go is the last step.
+    The state that is left when the pickers have let go counts as one more step.
     """
     (simulation, pickers), episode = shared
 
     def step_cost(state: State) -> Float[Array, ""]:
         return task.cost_fn(episode, state.position)
 
-    state, costs = rollout(simulation, pickers, at_rest(episode.start), actions, step_cost)
-    left = settle(simulation, state, task.release_steps)
-    return costs.sum() + step_cost(left)
+    start = at_rest(episode.start)
+    _, costs = rollout(simulation, pickers, start, _then_idle(actions, 1), step_cost)
+    return costs.sum()
 
 
 def _execute(
-    task: Task, physics: tuple[Simulation, Pickers], episode: Episode, actions: Actions
+    task: Task, shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
 ) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""]]:
-    simulation, pickers = physics
+    """Positions at the start, after each action and settled, and the score of the last."""
+    (simulation, pickers), episode = shared
     start = at_rest(episode.start)
-    state, positions = rollout(simulation, pickers, start, actions)
-    final = settle(simulation, state, task.settle_steps).position
-    positions = jnp.concatenate([start.position[None], positions, final[None]])
-    return positions, score(task, episode, final)
+    followed = _then_idle(actions, task.settle_actions)
+    final, positions = rollout(simulation, pickers, start, followed)
+    during = positions[: task.num_actions]
+    positions = jnp.concatenate([start.position[None], during, final.position[None]])
+    return positions, score(task, episode, final.position)
+
+
+def _then_idle(actions: Actions, count: int) -> Actions:
+    """A plan followed by `count` actions that grasp nothing."""
+    num_pickers = actions.pick.shape[1]
+    return Actions(
+        jnp.concatenate([actions.pick, jnp.full((count, num_pickers), NONE)]),
+        jnp.concatenate([actions.displacement, jnp.zeros((count, num_pickers, 3))]),
+    )
 
 
 def save_plan(path: Path, actions: Actions, positions: Float[np.ndarray, "T2 N 3"]) -> None:
@@ -207,9 +219,12 @@ def load_plan(path: Path) -> tuple[Actions, dict[str, Any]]:
     Raises:
         ValueError: if the file holds no plan.
     """
-    with np.load(path) as file:
-        arrays = dict(file)
-    missing = {"pick", "displacement"} - arrays.keys()
+    try:
+        with path.open("rb") as file:
+            arrays = dict(np.load(file))
+    except (ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read ({error}); it is not a saved plan") from error
+    missing = {"pick", "displacement", "positions"} - arrays.keys()
     if missing:
         raise ValueError(f"{path} has no {', '.join(sorted(missing))}; it is not a saved plan")
-    return Actions(arrays["pick"], arrays["displacement"]), arrays
+    return Actions(jnp.asarray(arrays["pick"]), jnp.asarray(arrays["displacement"])), arrays

@@ -7,14 +7,15 @@ GPU the whole population in one `vmap` is. See `Layout`.
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,15 @@ class PopulationMap:
         self._devices = [devices[w % len(devices)] for w in range(layout.num_workers)]
         self._pool = ThreadPoolExecutor(layout.num_workers)
 
-        def share_fn(shared: PyTree[Any], share: PyTree[Any]) -> PyTree[Any]:
-            one = lambda sample: sample_fn(shared, sample)
+        trees = jax.tree.structure(shared), jax.tree.structure(batch)
+
+        # Of leaves: what is compiled would otherwise make trees of things that are no arrays.
+        def share_fn(shared: list[Array], share: list[Array]) -> PyTree[Any]:
+            shared = jax.tree.unflatten(trees[0], shared)
+
+            def one(sample: list[Array]) -> PyTree[Any]:
+                return sample_fn(shared, jax.tree.unflatten(trees[1], sample))
+
             if layout.chunk_size == 1:
                 return jax.lax.map(one, share)
             return jax.lax.map(one, share, batch_size=layout.chunk_size)
@@ -102,7 +110,7 @@ class PopulationMap:
         start = time.perf_counter()
         share = self._shares(batch)[0]
         self._compiled = {
-            device: jitted.lower(*jax.device_put((shared, share), device)).compile()
+            device: jitted.lower(*jax.device_put((jax.tree.leaves(shared), share), device)).compile()
             for device in dict.fromkeys(self._devices)
         }
         self.compile_seconds = time.perf_counter() - start
@@ -119,27 +127,22 @@ class PopulationMap:
                 f"the batch has {population} samples; the function was compiled for at most "
                 f"{self._population}"
             )
-        results = self._pool.map(self._run, self._devices, [shared] * len(self._devices),
-                                 self._shares(batch))
+        run = partial(self._run, jax.tree.leaves(shared))
+        results = self._pool.map(run, self._devices, self._shares(batch))
         return jax.tree.map(lambda *parts: np.concatenate(parts)[:population], *results)
 
-    def _run(self, device: jax.Device, shared: PyTree[Any], share: PyTree[Any]) -> PyTree[Any]:
+    def _run(
+        self, shared: list[Any], device: jax.Device, share: list[np.ndarray]
+    ) -> PyTree[np.ndarray]:
         return jax.device_get(self._compiled[device](*jax.device_put((shared, share), device)))
 
-    def _shares(self, batch: PyTree[Any]) -> Sequence[PyTree[Any]]:
-        """Equal shares, the last ones filled up with copies of the last sample."""
-        size, workers = self._share, self._layout.num_workers
-
-        def fill(array: Any) -> np.ndarray:
-            array = np.asarray(array)
-            padding = np.repeat(array[-1:], size * workers - len(array), axis=0)
-            return np.concatenate([array, padding])
-
-        filled = jax.tree.map(fill, batch)
-        return [
-            jax.tree.map(lambda array, w=w: array[w * size : (w + 1) * size], filled)
-            for w in range(workers)
-        ]
+    def _shares(self, batch: PyTree[Any]) -> list[list[np.ndarray]]:
+        """Leaves of equal shares, the last ones filled up with copies of the last sample."""
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(batch)]
+        wanted = np.arange(self._share * self._layout.num_workers)
+        wanted = np.minimum(wanted, len(leaves[0]) - 1)
+        shares = np.split(wanted, self._layout.num_workers)
+        return [[leaf[share] for leaf in leaves] for share in shares]
 
 
 def _ceil_to(count: int, multiple: int) -> int:

@@ -5,7 +5,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance, sample_surface
+from jaxsimp.simplify.hausdorff import (
+    Surface,
+    _farthest,
+    hausdorff_distance,
+    sample_surface,
+)
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
 SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -112,19 +117,15 @@ def test_no_point_is_farther_from_a_sample_than_the_bound(seed, spacing):
 @given(seeds, st.integers(-18, -6))
 def test_triangles_of_almost_no_height_are_segments(seed, exponent):
     rng = np.random.default_rng(seed)
-    start, end = rng.normal(size=(2, 3))
-    middle = start + rng.uniform() * (end - start) + 10.0**exponent * rng.normal(size=3)
-    corners = np.stack([start, end, middle])[rng.permutation(3)]
-    points = rng.normal(size=(3, 3))
-    sliver, triangle = (Surface(c, np.array([[0, 1, 2]])) for c in (corners, points))
-    dense = sample_surface(triangle, 0.1)
-    along = start + np.linspace(0, 1, 200)[:, None] * (end - start)
-    backward = nearest_by_trimesh(along, triangle)
-    expected = max(distance_to_segment(dense, start, end).max(), backward.max())
-    # The sliver's height is at most some 1e-5; its samples are 0.1 apart, those here closer.
-    assert hausdorff_distance(sliver, triangle, 0.1) == pytest.approx(
-        expected, abs=0.1 / np.sqrt(3)
-    )
+    for _ in range(100):  # libigl errs on some of those that are not quite segments
+        start, end = rng.normal(size=(2, 3))
+        middle = start + rng.uniform() * (end - start) + 10.0**exponent * rng.normal(size=3)
+        corners = np.stack([start, end, middle])[rng.permutation(3)]
+        point = rng.normal(size=(1, 3))
+        expected = distance_to_segment(point, start, end)[0]
+        # The height of the triangle is some 1e-6 at most, and so is the difference.
+        measured = _farthest(point, Surface(corners, np.array([[0, 1, 2]])))
+        assert measured == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("faces", [[[0, 0, 0]], [[0, 1, 1]], [[0, 1, 4]]])
