@@ -52,7 +52,7 @@ _PAPER = CEMConfig(
     num_iterations=20, smoothing=0.0, initial_spread=0.5**0.5, keep_best=False, returns="mean"
 )
 BUDGETS = {
-    "default": Budget(rope=CEMConfig(num_iterations=30), cloth=CEMConfig()),
+    "default": Budget(rope=CEMConfig(num_iterations=24), cloth=CEMConfig(num_iterations=18)),
     "paper": Budget(
         rope=dataclasses.replace(_PAPER, population=70),
         cloth=dataclasses.replace(_PAPER, population=333),
@@ -126,6 +126,8 @@ def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) ->
     for name in names:
         if name not in known:
             raise ValueError(f"unknown {kind} {name!r}; choose from {', '.join(known)}")
+        if names.count(name) > 1:
+            raise ValueError(f"{kind} {name!r} is given twice; give it once")
 
 
 def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:

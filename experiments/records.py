@@ -49,7 +49,7 @@ def open_folder(folder: Path, config: Mapping[str, Any]) -> None:
     path = folder / CONFIG_FILE
     wanted = json.loads(json.dumps(config))
     if path.exists():
-        _require_same(folder, json.loads(path.read_text()), wanted)
+        _require_same(folder, _read_config(path), wanted)
     elif folder.is_dir() and any(folder.iterdir()):
         raise ResultsError(
             f"{folder} holds files but no {CONFIG_FILE}; give an empty or a new folder with --out"
@@ -61,6 +61,16 @@ def open_folder(folder: Path, config: Mapping[str, Any]) -> None:
         raise ResultsError(
             f"{folder} cannot be written to ({error.strerror}); give another folder with --out"
         ) from error
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    try:
+        config = json.loads(path.read_text())
+    except ValueError:  # neither JSON nor text
+        config = None
+    if not isinstance(config, dict):
+        raise ResultsError(f"{path} is no configuration of ours; give another folder with --out")
+    return config
 
 
 def _require_same(folder: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:

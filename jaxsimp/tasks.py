@@ -87,9 +87,7 @@ class Task:
         return round(self.action_seconds / self.time_step)
 
 
-def score(
-    task: Task, episode: Episode, position: Float[Array, "N 3"]
-) -> Float[Array, ""]:
+def score(task: Task, episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
     """Normalised score `(c_0 - c) / c_0`: 1 at the goal, 0 for a state as good as the start."""
     start = task.cost_fn(episode, jnp.asarray(episode.start))
     return (start - task.cost_fn(episode, position)) / start
@@ -312,6 +310,7 @@ def _fold_task(
         cost_fn=cost,
         limits=(0.2, 0.2, 0.2),
         num_actions=3,
+        action_seconds=0.25,
     )
 
 

@@ -29,8 +29,16 @@ def plot_model_errors(models: Mapping[str, KeyPoints]) -> "Figure":
     for axes, (name, model) in zip(panels, models.items(), strict=True):
         axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
         axes.axhline(model.threshold * 1e3, color=GOAL_COLOR, ls="--", label="threshold")
-        axes.plot(model.sizes[-1], model.errors[-1] * 1e3, "o", ms=11, mfc="none", mec=COLORS[1],
-                  mew=2, label=f"chosen: {len(model)} key points")
+        axes.plot(
+            model.sizes[-1],
+            model.errors[-1] * 1e3,
+            "o",
+            ms=11,
+            mfc="none",
+            mec=COLORS[1],
+            mew=2,
+            label=f"chosen: {len(model)} key points",
+        )
         axes.set(title=_title(name), xlabel="key points", ylabel="model error (mm)")
         axes.set_xticks(np.arange(model.sizes[0], model.sizes[-1] + 1))
         axes.set_xlim(model.sizes[0] - 0.5, model.sizes[-1] + 0.5)
@@ -51,8 +59,9 @@ def plot_models(models: Mapping[str, tuple[Body, Positions, KeyPoints]]) -> "Fig
         closed = model.elements[:, [*range(model.elements.shape[1]), 0]]
         for element in closed if model.elements.shape[1] > 2 else model.elements:
             axes.plot(*model.positions[element].T, color=COLORS[0], lw=1.5, zorder=5)
-        axes.scatter(*model.positions.T, color=COLORS[1], s=60, marker="*", zorder=6,
-                     depthshade=False)
+        axes.scatter(
+            *model.positions.T, color=COLORS[1], s=60, marker="*", zorder=6, depthshade=False
+        )
         _frame(axes, [goal], zoom=0.95)
         axes.set_title(f"{_title(name)}: {len(model)} key points")
     return figure
@@ -114,19 +123,29 @@ def plot_executions(
 
     columns = max(len(positions) for positions, _ in executions.values()) + 1
     figure, grid = plt.subplots(
-        len(executions), columns, figsize=(2.2 * columns, 2.3 * len(executions) + 0.4),
-        squeeze=False, subplot_kw={"projection": "3d"}, layout="constrained",
+        len(executions),
+        columns,
+        figsize=(2.2 * columns, 2.3 * len(executions) + 0.4),
+        squeeze=False,
+        subplot_kw={"projection": "3d"},
+        layout="constrained",
     )
     every = [goal, *(frame for positions, _ in executions.values() for frame in positions)]
     for row, (method, (positions, value)) in zip(grid, executions.items(), strict=True):
         frames = [*positions, goal]
-        names = ["start", *(f"action {i}" for i in range(1, len(positions) - 1)),
-                 f"settled, score {value:.2f}", "goal"]
+        names = [
+            "start",
+            *(f"action {i}" for i in range(1, len(positions) - 1)),
+            f"settled, score {value:.2f}",
+            "goal",
+        ]
         for axes, frame, name in zip(row, frames, names, strict=True):
             draw_body(axes, body, frame, GOAL_COLOR if name == "goal" else COLORS[0])
             _frame(axes, every)
             axes.set_title(name, fontsize="small")
-        row[0].text2D(0.0, 1.12, method, transform=row[0].transAxes, weight="bold", fontsize="small")
+        row[0].text2D(
+            0.0, 1.12, method, transform=row[0].transAxes, weight="bold", fontsize="small"
+        )
     figure.suptitle(_title(title))
     return figure
 
@@ -141,8 +160,15 @@ def draw_body(axes: "Axes", body: Body, positions: Positions, color: str) -> Non
         color: of the body.
     """
     if len(body.faces):
-        axes.plot_trisurf(*positions.T, triangles=body.faces, color=color, alpha=0.55,
-                          edgecolor="none", antialiased=False, shade=True)
+        axes.plot_trisurf(
+            *positions.T,
+            triangles=body.faces,
+            color=color,
+            alpha=0.55,
+            edgecolor="none",
+            antialiased=False,
+            shade=True,
+        )
         for edge in _outline(body):
             axes.plot(*positions[edge].T, color="black", lw=0.6)
     else:
@@ -163,9 +189,11 @@ def _frame(axes: "Axes", shown: Sequence[Positions], zoom: float = 1.25) -> None
     low[2], high[2] = 0.0, max(high[2], 1e-3)
     span = np.maximum(high - low, 0.05 * np.ptp(points))
     middle = (low + high) / 2
-    axes.set(xlim=(middle[0] - span[0] / 2, middle[0] + span[0] / 2),
-             ylim=(middle[1] - span[1] / 2, middle[1] + span[1] / 2),
-             zlim=(0, span[2]))
+    axes.set(
+        xlim=(middle[0] - span[0] / 2, middle[0] + span[0] / 2),
+        ylim=(middle[1] - span[1] / 2, middle[1] + span[1] / 2),
+        zlim=(0, span[2]),
+    )
     axes.set_box_aspect(span, zoom=zoom)
     axes.view_init(elev=50, azim=-65)
     axes.set_axis_off()
@@ -178,11 +206,15 @@ def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Fig
     columns = min(2, len(items))
     rows = -(-len(items) // columns)
     figure, grid = plt.subplots(
-        rows, columns, figsize=(4.6 * columns, 3.3 * rows), squeeze=False, layout="constrained",
+        rows,
+        columns,
+        figsize=(4.6 * columns, 3.3 * rows),
+        squeeze=False,
+        layout="constrained",
         subplot_kw={"projection": "3d"} if three_d else {},
     )
     panels = list(grid.ravel())
-    for unused in panels[len(items):]:
+    for unused in panels[len(items) :]:
         unused.remove()
     return figure, panels[: len(items)]
 

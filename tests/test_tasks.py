@@ -345,7 +345,6 @@ def test_tasks_have_other_resolutions(name, resolution):
     simulation = task.simulation()
     assert float(simulation.time_step) == pytest.approx(task.time_step, rel=1e-6)
     assert task.action_steps * task.time_step == pytest.approx(0.3, abs=task.time_step / 2)
-    assert task.settle_steps * task.time_step == pytest.approx(1.0, abs=task.time_step / 2)
 
 
 @pytest.mark.parametrize("name", task_names())

@@ -85,8 +85,8 @@ def grasp(
     Displacements are clipped to the limits and to the table. A particle goes to the first
     picker that names it. The motion of two pickers is refused, C(a) < 0 of Eq. 2, when it
     would end with their particles at `max_stretch` times their rest distance or farther; both
-    then hold still, which may refuse the motion of a third. (On a straight path the distance of two particles is convex in time, so
-    no state on the way is farther apart than both its ends.)
+    then hold still, which may refuse the motion of a third. (On a straight path the distance of
+    two particles is convex in time, so no state on the way is farther apart than both its ends.)
 
     Args:
         pickers: the limits.

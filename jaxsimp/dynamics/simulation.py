@@ -71,8 +71,8 @@ def make_simulation(body: Body, time_step: float = 2e-3, gravity: float = 9.81) 
         # The message rounds down: the number that it names is stable.
         raise ValueError(
             f"time_step is {time_step:.4g} s; this {body.name} is stable from above 0 to "
-            f"{largest * (1 - 5e-4):.4g} s. Take a smaller time step, a lower stiffness or damping, "
-            f"or a larger mass"
+            f"{largest * (1 - 5e-4):.4g} s. Take a smaller time step, a lower stiffness or "
+            f"damping, or a larger mass"
         )
     if not np.isfinite(gravity):
         raise ValueError(f"gravity is {gravity}; give a finite acceleration")

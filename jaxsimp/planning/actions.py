@@ -37,9 +37,7 @@ class ActionSpace:
     num_actions: int
     num_pickers: int
 
-    def actions(
-        self, choice: Int[Array, "*B T G"], direction: Float[Array, "*B T G 3"]
-    ) -> Actions:
+    def actions(self, choice: Int[Array, "*B T G"], direction: Float[Array, "*B T G 3"]) -> Actions:
         """The actions of choices (K means None) and displacements in units of the limits."""
         ids = jnp.append(self.candidates, NONE)
         limits = jnp.broadcast_to(self.limits, direction.shape)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Float, PRNGKeyArray, PyTree
 
 from jaxsimp.dynamics import Actions
 from jaxsimp.planning.actions import ActionSpace, Encoding
@@ -48,7 +48,7 @@ class CEMConfig:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
         if not 0 < self.elite_fraction <= 1:
-            raise ValueError(f"elite_fraction is {self.elite_fraction}; give more than 0, at most 1")
+            raise ValueError(f"elite_fraction is {self.elite_fraction}; give above 0, at most 1")
         if not 0 <= self.smoothing < 1:
             raise ValueError(f"smoothing is {self.smoothing}; give at least 0 and less than 1")
         if not 0 < self.initial_spread < np.inf:
@@ -166,9 +166,7 @@ class _Pool:
 
 
 # Random bits compile five times as fast unoptimised, and a round draws them once.
-@partial(
-    jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0}
-)
+@partial(jax.jit, static_argnums=(0, 1), compiler_options={"xla_backend_optimization_level": 0})
 def _ask(
     encoding: Encoding,
     population: int,

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
@@ -90,6 +91,8 @@ class PopulationMap:
         devices = jax.local_devices()
         self._devices = [devices[w % len(devices)] for w in range(layout.num_workers)]
         self._pool = ThreadPoolExecutor(layout.num_workers)
+        # `jax.enable_x64` as a context holds for one thread: the workers are told.
+        self._x64 = jnp.result_type(float) == jnp.float64
 
         trees = jax.tree.structure(shared), jax.tree.structure(batch)
 
@@ -108,9 +111,9 @@ class PopulationMap:
         options = {"xla_cpu_prefer_vector_width": 512} if devices[0].platform == "cpu" else None
         jitted = jax.jit(share_fn, compiler_options=options)
         start = time.perf_counter()
-        share = self._shares(batch)[0]
+        arguments = jax.tree.leaves(shared), self._shares(batch)[0]
         self._compiled = {
-            device: jitted.lower(*jax.device_put((jax.tree.leaves(shared), share), device)).compile()
+            device: jitted.lower(*jax.device_put(arguments, device)).compile()
             for device in dict.fromkeys(self._devices)
         }
         self.compile_seconds = time.perf_counter() - start
@@ -134,7 +137,8 @@ class PopulationMap:
     def _run(
         self, shared: list[Any], device: jax.Device, share: list[np.ndarray]
     ) -> PyTree[np.ndarray]:
-        return jax.device_get(self._compiled[device](*jax.device_put((shared, share), device)))
+        with jax.enable_x64(self._x64):
+            return jax.device_get(self._compiled[device](*jax.device_put((shared, share), device)))
 
     def _shares(self, batch: PyTree[Any]) -> list[list[np.ndarray]]:
         """Leaves of equal shares, the last ones filled up with copies of the last sample."""

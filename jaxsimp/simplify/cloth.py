@@ -164,7 +164,10 @@ class _Collapses:
         yield
         while self.queue and len(self.vertices) > MIN_SIZE:
             *_, removed, kept, ticket = heapq.heappop(self.queue)
-            if self.latest.get((removed, kept)) == ticket and self._links(removed, kept):
+            if self.latest.get((removed, kept)) != ticket:
+                continue
+            # One that is refused is offered again when its surroundings change.
+            if self._links(removed, kept) and self._sound(removed, kept):
                 self._enqueue(self._collapse(removed, kept))
                 yield
 
@@ -183,6 +186,18 @@ class _Collapses:
             return False
         inner = len(shared) == 2
         return not (inner and self._on_boundary(removed) and self._on_boundary(kept))
+
+    def _sound(self, removed: int, kept: int) -> bool:
+        """The collapse leaves triangles, none of them degenerate or turned over."""
+        moving = list(self.around[removed] - self.around[kept])
+        if not moving:
+            return False
+        before = self.faces[moving]
+        old, _ = _normals(self.points[before])
+        new, longest = _normals(self.points[np.where(before == removed, kept, before)])
+        wide = np.sum(new**2, axis=1) > (LEAST_HEIGHT * longest) ** 2
+        upright = np.sum(old * new, axis=1) >= 0
+        return bool((wide & upright).all())
 
     def _on_boundary(self, vertex: int) -> bool:
         return len(self.ring[vertex]) != len(self.around[vertex])
@@ -207,39 +222,22 @@ class _Collapses:
         return changed
 
     def _enqueue(self, vertices: Iterable[int]) -> None:
-        """Price anew all collapses along the edges at `vertices`."""
+        """Offer anew all collapses along the edges at `vertices`."""
         edges = {(v, w) for v in vertices for w in self.ring[v]}
         edges |= {(w, v) for v, w in edges}
-        pairs = [(v, w) for v, w in sorted(edges) if self.around[v] - self.around[w]]
-        if not pairs:
-            return
-        costs, lengths, allowed = self._price(np.array(pairs))
-        for pair, cost, length, ok in zip(pairs, costs, lengths, allowed, strict=True):
+        pairs = sorted(edges)
+        for pair, cost, length in zip(pairs, *self._price(np.array(pairs)), strict=True):
             ticket = self.latest[pair] = self.latest.get(pair, 0) + 1
-            if ok:
-                heapq.heappush(self.queue, (cost, length, *pair, ticket))
+            heapq.heappush(self.queue, (cost, length, *pair, ticket))
 
-    def _price(self, pairs: np.ndarray) -> tuple[list[float], list[float], list[bool]]:
-        """Cost and length of collapses (removed, kept), and which leave the triangles sound."""
+    def _price(self, pairs: np.ndarray) -> tuple[list[float], list[float]]:
+        """Quadric errors of the collapses (removed, kept), and lengths of their edges."""
         removed, kept = pairs.T
         target = _homogeneous(self.points[kept])
         quadric = self.quadrics[removed] + self.quadrics[kept]
         error = np.einsum("pi,pij,pj->p", target, quadric, target)
-        cost = np.maximum(error / ROUNDING, 1.0)
         length = np.linalg.norm(self.points[kept] - self.points[removed], axis=1)
-        return cost.round(6).tolist(), length.round(6).tolist(), self._sound(pairs).tolist()
-
-    def _sound(self, pairs: np.ndarray) -> np.ndarray:
-        """Whether a collapse leaves no triangle degenerate or turned over, shape (P,)."""
-        moving = [list(self.around[v] - self.around[w]) for v, w in pairs.tolist()]
-        counts = [len(rows) for rows in moving]
-        before = self.faces[np.concatenate(moving)]
-        removed, kept = np.repeat(pairs, counts, axis=0).T[:, :, None]
-        old, _ = _normals(self.points[before])
-        new, longest = _normals(self.points[np.where(before == removed, kept, before)])
-        wide = np.sum(new**2, axis=1) > (LEAST_HEIGHT * longest) ** 2
-        upright = np.sum(old * new, axis=1) >= 0
-        return np.logical_and.reduceat(wide & upright, np.cumsum([0, *counts[:-1]]))
+        return np.maximum(error / ROUNDING, 1.0).round(6).tolist(), length.round(6).tolist()
 
 
 def _diagonals(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -24,9 +24,7 @@ LAYOUT = Layout(chunk_size=1, num_workers=2)
 def small_task():
     """A short rope whose actions take few time steps: plans take milliseconds."""
     task = make_task("rope_folding", 9)
-    return dataclasses.replace(
-        task, num_actions=2, action_seconds=0.05, release_seconds=0.03, settle_seconds=0.1
-    )
+    return dataclasses.replace(task, num_actions=2, action_seconds=0.05, settle_actions=2)
 
 
 @lru_cache(None)
@@ -60,8 +58,8 @@ def independent_frames(actions: Actions) -> list[np.ndarray]:
         )
         state, _ = rollout(simulation, pickers, state, one)
         frames.append(state.position)
-    frames.append(settle(simulation, state, task.release_steps).position)
-    frames.append(settle(simulation, state, task.settle_steps).position)
+    frames.append(settle(simulation, state, task.action_steps).position)
+    frames.append(settle(simulation, state, 2 * task.action_steps).position)
     return frames
 
 
@@ -89,7 +87,7 @@ from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner, save_plan
 from jaxsimp.tasks import make_task
 task = dataclasses.replace(
     make_task("rope_folding", 9),
-    num_actions=2, action_seconds=0.05, release_seconds=0.03, settle_seconds=0.1,
+    num_actions=2, action_seconds=0.05, settle_actions=2,
 )
 planner = Planner(task, CEMConfig(num_iterations=2, population=6), Layout(1, 2))
 episode = task.episode_fn(3)
@@ -165,7 +163,7 @@ def test_an_execution_is_that_of_an_independent_rollout():
 def test_a_plan_is_made_of_candidates_within_the_limits():
     plan = planned(3)
     assert plan.actions.pick.shape == (2, 2)
-    assert set(plan.actions.pick.ravel()) <= {*CANDIDATES, NONE}
+    assert set(np.asarray(plan.actions.pick).ravel().tolist()) <= {*CANDIDATES.tolist(), NONE}
     assert np.all(np.abs(plan.actions.displacement) <= np.float32(0.15))
     assert plan.search.num_rollouts == 12
     assert plan.seconds > 0
@@ -207,8 +205,7 @@ def test_float64_plans(x64):
         make_task("rope_folding", 5),
         num_actions=1,
         action_seconds=0.02,
-        release_seconds=0.01,
-        settle_seconds=0.01,
+        settle_actions=1,
     )
     made = Planner(task, CEMConfig(num_iterations=1, population=2), Layout(1, 1))
     plan = made.plan(task.episode_fn(0), np.array([0]), ENCODINGS["categorical"], 0)

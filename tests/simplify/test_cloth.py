@@ -59,7 +59,7 @@ def test_folds_of_the_paper_have_its_key_points(direction):
     assert_paper(simplify_cloth(cloth(25), folded(25, direction)), 25, direction)
 
 
-@pytest.mark.parametrize("count", [12, 13])
+@pytest.mark.parametrize("count", [9, 12, 13])
 @pytest.mark.parametrize("direction", FOLDS)
 def test_other_meshes_have_the_same_key_points(count, direction):
     assert_paper(simplify_cloth(cloth(count), folded(count, direction)), count, direction)

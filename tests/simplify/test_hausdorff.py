@@ -59,16 +59,7 @@ def test_distance_is_measured_in_both_directions():
 
 
 def test_farthest_point_within_a_face_is_found_within_the_bound():
-    # A tent over the square: its apex is a vertex, but the square's nearest rival is a face
-    # centre, and a hole is farthest from the rim where no vertex is.
-    rim = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, -0.2, 0]])
-    hole = Surface(rim, np.array([[0, 1, 2]]))
-    sheet = Surface(
-        np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 2, 0], [0.5, -0.2, 0]]),
-        np.array([[0, 1, 2], [0, 3, 1]]),
-    )
-    assert hausdorff_distance(sheet, hole, 0.05) == pytest.approx(2.0, abs=ROUNDING)
-    # From a triangle to the two sides of itself: the incentre-like point lies inside a face.
+    # A triangle and its three sides: the incentre, no vertex of either, is farthest.
     corners = np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0]])
     rims = Surface(corners, np.array([[0, 1, 1], [1, 2, 2], [2, 0, 0]]))
     full = Surface(corners, np.array([[0, 1, 2]]))
@@ -114,18 +105,17 @@ def test_no_point_is_farther_from_a_sample_than_the_bound(seed, spacing):
     assert nearest.max() <= spacing / np.sqrt(3) + ROUNDING
 
 
-@given(seeds, st.integers(-18, -6))
-def test_triangles_of_almost_no_height_are_segments(seed, exponent):
-    rng = np.random.default_rng(seed)
-    for _ in range(100):  # libigl errs on some of those that are not quite segments
+@pytest.mark.parametrize("height", [0.0, 1e-18, 1e-17, 1e-16, 1e-14, 1e-11, 1e-9, 1e-7])
+def test_triangles_of_almost_no_height_are_segments(height):
+    rng = np.random.default_rng(0)
+    for _ in range(500):  # libigl errs on one in sixty at the worst height
         start, end = rng.normal(size=(2, 3))
-        middle = start + rng.uniform() * (end - start) + 10.0**exponent * rng.normal(size=3)
+        middle = start + rng.uniform() * (end - start) + height * rng.normal(size=3)
         corners = np.stack([start, end, middle])[rng.permutation(3)]
         point = rng.normal(size=(1, 3))
         expected = distance_to_segment(point, start, end)[0]
-        # The height of the triangle is some 1e-6 at most, and so is the difference.
         measured = _farthest(point, Surface(corners, np.array([[0, 1, 2]])))
-        assert measured == pytest.approx(expected, abs=1e-5)
+        assert measured == pytest.approx(expected, abs=10 * height + ROUNDING)
 
 
 @pytest.mark.parametrize("faces", [[[0, 0, 0]], [[0, 1, 1]], [[0, 1, 4]]])

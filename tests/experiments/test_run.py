@@ -1,0 +1,321 @@
+"""The command: what a study leaves behind, going on after a kill, and wrong requests."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib.image
+import numpy as np
+import pytest
+
+from experiments import paper, run
+from jaxsimp.planning import ENCODINGS, CEMConfig, load_plan
+from jaxsimp.tasks import make_task, score
+
+ROOT = Path(__file__).parents[2]
+TASKS = ("rope_folding", "cloth_diagonal_folding")
+OPTIONS = (
+    *("--tasks", *TASKS, "--seeds", "1", "--resolution", "9", "--num-actions", "1"),
+    *("--population", "4", "--num-iterations", "2"),
+)
+TIMINGS = ("plan_seconds", "compile_seconds", "environment")
+
+
+def command(*options: str) -> int:
+    """What `python -m experiments.run` does, without another process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["experiments.run", *map(str, options)])
+        return run.main()
+
+
+def finished(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def untimed(rows: list[dict]) -> list[dict]:
+    return [{name: row[name] for name in row if name not in TIMINGS} for row in rows]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The results of a tiny study."""
+    folder = tmp_path_factory.mktemp("results") / "tiny"
+    assert command(*OPTIONS, "--out", folder) == 0
+    return folder
+
+
+# --- what a study leaves behind -------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_summary_has_its_schema(folder):
+    summary = finished(folder)
+    assert summary.keys() == {"environment", "models", "runs"}
+    assert {"versions", "commit", "device", "cores"} <= summary["environment"].keys()
+    assert [model["task"] for model in summary["models"]] == list(TASKS)
+    for model in summary["models"]:
+        assert model["method"]
+        assert len(model["sizes"]) == len(model["errors"]) > 0
+        assert model["errors"][-1] < model["threshold"]
+        assert len(model["key_points"]) == model["sizes"][-1]
+        particles = make_task(model["task"], 9).body.num_particles
+        assert set(model["key_points"]) <= set(range(particles))
+
+
+@pytest.mark.slow
+def test_runs_have_their_schema(folder):
+    runs = finished(folder)["runs"]
+    combinations = [
+        (task, space, encoding, 0)
+        for task in TASKS
+        for space in paper.ACTION_SPACES
+        for encoding in ENCODINGS
+    ]
+    found = [tuple(r[k] for k in ("task", "action_space", "pick_encoding", "seed")) for r in runs]
+    assert found == combinations
+    for row in runs:
+        assert row["num_particles"] == (9 if row["task"] == "rope_folding" else 81)
+        assert 2 <= row["num_key_points"] < row["num_particles"]
+        assert len(row["cost_per_iteration"]) == 2
+        assert row["cost_per_iteration"][1] <= row["cost_per_iteration"][0]
+        assert row["success"] == (row["final_score"] >= 0.9)
+        assert row["rollouts"] == 8
+        assert row["non_finite"] == 0
+        assert row["plan_seconds"] > 0
+        assert row["compile_seconds"] >= 0
+        assert row["config"]["population"] == 4
+        assert row["config"]["num_iterations"] == 2
+        assert row["config"]["num_actions"] == 1
+        assert row["environment"]["versions"]["jax"]
+
+
+@pytest.mark.slow
+def test_plans_load_and_end_in_the_score_of_their_run(folder):
+    summary = finished(folder)
+    key_points = {model["task"]: model["key_points"] for model in summary["models"]}
+    for row in summary["runs"]:
+        actions, arrays = load_plan(folder / row["plan"])
+        task = make_task(row["task"], 9)
+        assert arrays["positions"].shape == (3, task.body.num_particles, 3)
+        last = np.asarray(arrays["positions"][-1], np.float32)
+        episode = task.episode_fn(row["seed"])
+        found = score(task, episode, jnp.asarray(last))
+        # float32, compiled with other code around it
+        assert row["final_score"] == pytest.approx(float(found), abs=1e-5)
+        if row["action_space"] == "key_points":
+            picked = set(np.asarray(actions.pick).ravel().tolist())
+            assert picked <= {*key_points[row["task"]], -1}
+
+
+@pytest.mark.slow
+def test_figures_and_report_are_there(folder):
+    figures = {"model_errors", "models", "costs", *(f"plans_{name}" for name in TASKS)}
+    report = (folder / "report.md").read_text()
+    assert {path.stem for path in (folder / "figures").iterdir()} == figures
+    for name in figures:
+        picture = matplotlib.image.imread(folder / "figures" / f"{name}.png")
+        assert min(picture.shape[:2]) > 200
+        # Not blank: some, but not most of it, is other than its commonest colour.
+        colours, counts = np.unique(picture.reshape(-1, 4), axis=0, return_counts=True)
+        assert len(colours) > 10
+        assert 1 - counts.max() / counts.sum() > 0.005
+        assert f"(figures/{name}.png)" in report
+    for task in TASKS:
+        assert f"| {task} |" in report
+    assert not list(folder.rglob("*.part"))
+
+
+# --- going on where it was ------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_finished_study_is_not_run_again(folder, tmp_path):
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    (copy / "summary.json").unlink()
+    before = (copy / "runs.jsonl").read_bytes()
+    assert command(*OPTIONS, "--out", copy) == 0
+    assert (copy / "runs.jsonl").read_bytes() == before
+    assert finished(copy)["runs"] == finished(folder)["runs"]
+
+
+@pytest.mark.slow
+def test_a_study_cut_short_in_a_row_goes_on_to_the_same_runs(folder, tmp_path):
+    # As a kill leaves it: five rows and a piece of the sixth, its plan half written.
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    for name in ("summary.json", "report.md"):
+        (copy / name).unlink()
+    lines = (copy / "runs.jsonl").read_text().splitlines(keepends=True)
+    (copy / "runs.jsonl").write_text("".join(lines[:5]) + lines[5][: len(lines[5]) // 2])
+    for row in map(json.loads, lines[5:]):
+        (copy / row["plan"]).unlink()
+    (copy / "plans" / "cloth.npz.part").write_bytes(b"half")
+    assert command(*OPTIONS, "--out", copy) == 0
+    assert untimed(finished(copy)["runs"]) == untimed(finished(folder)["runs"])
+    assert (copy / "runs.jsonl").read_text().splitlines(keepends=True)[:5] == lines[:5]
+    for row in finished(copy)["runs"]:
+        with np.load(copy / row["plan"]) as redone, np.load(folder / row["plan"]) as once:
+            np.testing.assert_array_equal(redone["positions"], once["positions"])
+
+
+@pytest.mark.slow
+def test_a_killed_process_goes_on_to_the_same_runs(folder, tmp_path):
+    out, rows = tmp_path / "killed", tmp_path / "killed" / "runs.jsonl"
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    with subprocess.Popen(
+        [sys.executable, "-m", "experiments.run", *OPTIONS, "--out", out],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        while process.poll() is None and not (rows.exists() and rows.stat().st_size):
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    left = len(rows.read_text().splitlines())
+    assert 1 <= left < 8
+    assert not (out / "summary.json").exists()
+    assert command(*OPTIONS, "--out", out) == 0
+    assert untimed(finished(out)["runs"]) == untimed(finished(folder)["runs"])
+
+
+def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch, capsys):
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "run_study", interrupt)
+    assert command(*OPTIONS, "--out", tmp_path / "new") == 130
+    assert "goes on" in capsys.readouterr().out
+
+
+# --- wrong requests -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--tasks", "rope_tying"), "unknown task 'rope_tying'; choose from rope_straightening"),
+        (("--action-spaces", "corners"), "unknown action space 'corners'; choose from key_points"),
+        (("--pick-encodings", "uniform"), "unknown pick encoding 'uniform'; choose from"),
+        (("--seeds", "0"), "seeds is 0; at least 1"),
+        (("--seeds", "-1", "--smoke"), "seeds is -1; at least 1"),
+        (("--num-actions", "0"), "num_actions is 0; at least 1"),
+        (("--population", "-5"), "population is -5; at least 1"),
+        (("--num-iterations", "0"), "num_iterations is 0; at least 1"),
+        (("--elite-fraction", "2"), "elite_fraction is 2.0; give"),
+        (("--smoothing", "1"), "smoothing is 1.0; give"),
+        (("--initial-spread", "nan"), "initial_spread is nan; give"),
+        (("--resolution", "3"), "resolution is 3; a task needs at least 5"),
+        (("--resolution", "0"), "resolution is 0; a task needs at least 5"),
+        (("--tasks", "rope_folding", "rope_folding"), "task 'rope_folding' is given twice"),
+        (("--pick-encodings", "categorical", "categorical"), "'categorical' is given twice"),
+    ],
+)
+def test_a_wrong_value_is_named_with_a_remedy_and_nothing_is_written(
+    tmp_path, capsys, options, message
+):
+    assert command(*options, "--out", tmp_path / "new") == 2
+    error = " ".join(capsys.readouterr().err.split())  # as the terminal's width breaks it
+    assert error.startswith("error: ")
+    assert message in error
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("options", [("--no-such-option",), ("--seeds", "many"), ("other",)])
+def test_options_that_do_not_parse_end_with_status_2(options, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        command(*options)
+    assert stopped.value.code == 2
+
+
+def test_folders_that_cannot_be_used_end_with_status_2(tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").write_text("mine")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "config.json").write_text('{"seeds": 7}')
+    before = sorted(tmp_path.rglob("*"))
+    told = {
+        "file": "is a file",
+        "file/below": "cannot be written to",
+        "foreign": "holds files",
+        "other": "made with another configuration",
+    }
+    for name, message in told.items():
+        assert command(*OPTIONS, "--out", tmp_path / name) == 2
+        error = " ".join(capsys.readouterr().err.split())
+        assert message in error
+        assert "--out" in error
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_command_ends_with_its_status(tmp_path):
+    # In a process of its own: the exit status and the stream of the message.
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.run", "--seeds", "0", "--out", tmp_path / "new"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "seeds is 0" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+def test_list_names_everything(capsys):
+    assert command("--list") == 0
+    told = capsys.readouterr().out
+    for name in (*TASKS, *paper.ACTION_SPACES, *ENCODINGS):
+        assert name in told
+
+
+# --- configuration --------------------------------------------------------------------------------
+
+
+def test_options_replace_the_settings_of_the_budget():
+    study = run.Options(
+        budget="paper", population=11, smoothing=0.3, keep_best=True, returns="best", num_actions=3
+    ).configuration()
+    task = study.task("rope_folding")
+    config = study.search_config(task)
+    assert config == CEMConfig(
+        num_iterations=20,
+        population=11,
+        elite_fraction=0.1,
+        smoothing=0.3,
+        initial_spread=0.5**0.5,
+        keep_best=True,
+        returns="best",
+    )
+    assert task.num_actions == 3
+
+
+def test_the_paper_budget_is_the_authors():
+    # Figures of the author's runs: horizon 15, 0.08 m an axis a step; 70 and 333 plans a round
+    # of 20, a tenth of them elites, no smoothing, variance 0.5, the mean returned.
+    study = run.Options(budget="paper").configuration()
+    for name, population, elites in [
+        ("rope_straightening", 70, 7),
+        ("cloth_side_folding", 333, 33),
+    ]:
+        task = study.task(name)
+        config = study.search_config(task)
+        assert (task.num_actions, task.limits) == (15, (0.08, 0.08, 0.08))
+        assert (config.population, config.num_elites) == (population, elites)
+        assert (config.num_iterations, config.smoothing, config.returns) == (20, 0.0, "mean")
+        assert config.initial_spread**2 == pytest.approx(0.5)
+        assert not config.keep_best
+
+
+def test_a_smoke_run_is_small():
+    study = run.Options(smoke=True).configuration()
+    assert study.seeds == 2
+    assert study.task("cloth_side_folding").body.num_particles == 81
+    assert run.Options(smoke=True).folder != run.Options().folder

@@ -1,0 +1,152 @@
+"""Pictures: what is drawn, from ordinary data and from data with failures in it."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from jaxsimp import goals, viz
+from jaxsimp.body import cloth, rope
+from jaxsimp.simplify import KeyPoints
+
+
+@pytest.fixture(autouse=True)
+def closed_figures():
+    yield
+    plt.close("all")
+
+
+def rope_model() -> KeyPoints:
+    return KeyPoints(
+        particles=np.array([0, 4, 8]),
+        positions=np.array([[0.0, 0.0, 0.0], [0.1, 0.2, 0.0], [0.2, 0.0, 0.0]]),
+        elements=np.array([[0, 1], [1, 2]]),
+        num_particles=9,
+        method="by hand",
+        sizes=(2, 3),
+        errors=(0.02, 0.001),
+        threshold=0.005,
+    )
+
+
+def cloth_model() -> KeyPoints:
+    return KeyPoints(
+        particles=np.array([0, 4, 20, 24]),
+        positions=np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.3, 0.0, 0.0], [0.3, 0.3, 0.0]]),
+        elements=np.array([[0, 2, 1], [2, 3, 1]]),
+        num_particles=25,
+        method="by hand",
+        sizes=(4,),
+        errors=(0.0,),
+        threshold=0.005,
+    )
+
+
+# --- intervals -----------------------------------------------------------------------------------
+
+
+@given(st.integers(2, 12), st.integers(1, 4), st.integers(0, 10**6))
+def test_mean_interval_is_that_of_scipy(runs, columns, seed):
+    values = np.random.default_rng(seed).normal(3.0, 2.0, (runs, columns))
+    mean, half = viz.mean_interval(values)
+    low, high = stats.t.interval(
+        0.95, runs - 1, loc=values.mean(axis=0), scale=stats.sem(values, axis=0)
+    )
+    np.testing.assert_allclose(mean - half, low, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(mean + half, high, rtol=1e-9, atol=1e-9)
+
+
+def test_mean_of_one_run_has_no_interval():
+    mean, half = viz.mean_interval(np.array([[1.0, 2.0]]))
+    np.testing.assert_array_equal(mean, [1.0, 2.0])
+    assert np.all(np.isnan(half))
+
+
+# --- figures -------------------------------------------------------------------------------------
+
+
+def test_model_errors_are_drawn_in_millimetres_with_the_chosen_size():
+    figure = viz.plot_model_errors({"some_task": rope_model()})
+    (axes,) = figure.axes
+    np.testing.assert_allclose(axes.lines[0].get_xdata(), [2, 3])
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), [20.0, 1.0])
+    assert axes.get_title() == "some task"
+    assert any("3 key points" in text.get_text() for text in axes.get_legend().get_texts())
+    assert axes.get_ylim()[0] <= 0 <= 20.0 <= axes.get_ylim()[1]
+    figure.canvas.draw()
+
+
+def test_models_are_drawn_over_their_goals():
+    flat = cloth((5, 5))
+    line = rope(9)
+    figure = viz.plot_models(
+        {
+            "rope": (line, goals.flat(line), rope_model()),
+            "cloth": (flat, goals.flat(flat), cloth_model()),
+            "third": (line, goals.flat(line), rope_model()),
+        }
+    )
+    assert [axes.get_title() for axes in figure.axes] == [
+        "rope: 3 key points",
+        "cloth: 4 key points",
+        "third: 3 key points",
+    ]
+    figure.canvas.draw()
+
+
+def test_costs_are_drawn_as_means_with_their_intervals():
+    runs = np.array([[3.0, 2.0, 1.0], [5.0, 2.0, 0.0]])
+    figure = viz.plot_costs({"task": {"one": runs, "two": runs[:1] + 1}})
+    (axes,) = figure.axes
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), [4.0, 2.0, 0.5])
+    np.testing.assert_allclose(axes.lines[1].get_ydata(), [4.0, 3.0, 2.0])
+    np.testing.assert_allclose(axes.lines[0].get_xdata(), [1, 2, 3])
+    # t with 1 degree of freedom is 12.706 at 97.5 %; sem of 3 and 5 is 1
+    band = axes.collections[0].get_paths()[0].vertices
+    assert band[:, 1].max() == pytest.approx(4 + 12.706, abs=1e-3)
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["one", "two"]
+    figure.canvas.draw()
+
+
+def test_costs_that_are_not_finite_are_left_out():
+    runs = np.array([[np.nan, 2.0], [1.0, 1.0]])
+    nothing = np.full((2, 2), np.nan)
+    figure = viz.plot_costs({"task": {"some": runs, "none": nothing}})
+    figure.canvas.draw()
+    assert np.isnan(figure.axes[0].lines[1].get_ydata()).all()
+
+
+@pytest.mark.parametrize("body", [rope(9), cloth((5, 5))], ids=["rope", "cloth"])
+def test_executions_are_drawn_frame_by_frame(body):
+    start = goals.flat(body)
+    frames = np.stack([start, start + [0.0, 0.0, 0.1], start])
+    figure = viz.plot_executions(
+        body, start, {"method one": (frames, 0.5), "method two": (frames, -1.0)}, "a_task"
+    )
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[:4] == ["start", "action 1", "settled, score 0.50", "goal"]
+    assert titles[6] == "settled, score -1.00"
+    limits = {(axes.get_xlim(), axes.get_ylim()) for axes in figure.axes}
+    assert len(limits) == 1  # one scale: frames can be compared
+    figure.canvas.draw()
+
+
+@pytest.mark.parametrize("body", [rope(9), cloth((5, 5))], ids=["rope", "cloth"])
+def test_an_execution_that_failed_is_drawn_without_its_lost_frames(body):
+    start = goals.flat(body)
+    frames = np.stack([start, np.full_like(start, np.nan), np.full_like(start, np.inf)])
+    figure = viz.plot_executions(body, start, {"failed": (frames, -np.inf)}, "a_task")
+    figure.canvas.draw()
+    assert np.all(np.isfinite(figure.axes[0].get_xlim()))
+
+
+def test_importing_viz_does_not_import_matplotlib():
+    import subprocess
+    import sys
+    from pathlib import Path
+
+    code = "import sys, jaxsimp.viz; sys.exit('matplotlib' in sys.modules)"
+    root = Path(__file__).parents[1]
+    assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
