@@ -106,7 +106,7 @@ def misfit(log_factor):
     return jnp.mean(jnp.sum((trajectory(log_factor) - observed) ** 2, axis=-1))
 
 
-steps = 40 if SMALL else 60
+steps = 150
 found, log_factors, misfits = descend(misfit, jnp.zeros(()), learning_rate=0.15, steps=steps)
 stretch = body.stiffness.max()
 print(f"true stiffness  {stretch * true_factor:.2f} N/m")

@@ -121,7 +121,7 @@ def test_costs_that_are_not_finite_are_left_out():
 @pytest.mark.parametrize("body", [rope(9), cloth((5, 5))], ids=["rope", "cloth"])
 def test_executions_are_drawn_frame_by_frame(body):
     start = goals.flat(body)
-    frames = np.stack([start, start + [0.0, 0.0, 0.1], start])
+    frames = np.stack([start, start + np.array([0.0, 0.0, 0.1]), start])
     figure = viz.plot_executions(
         body, start, {"method one": (frames, 0.5), "method two": (frames, -1.0)}, "a_task"
     )
