@@ -99,7 +99,7 @@ def grasp(
         held: shape (N,).
         displacement: of each held particle, zero elsewhere, shape (N, 3), metres.
     """
-    holds = _holds(action.pick)
+    holds = _holds(action.pick, len(position))
     start = position[action.pick]
     target = start + jnp.clip(action.displacement, -pickers.limits[None], pickers.limits[None])
     target = target.at[:, 2].max(floor)
@@ -111,10 +111,10 @@ def grasp(
     return chosen.any(axis=0), chosen.T.astype(moves.dtype) @ moves
 
 
-def _holds(pick: Int[Array, " G"]) -> Bool[Array, " G"]:
-    """Whether each picker holds a particle: it names one that no earlier picker names."""
+def _holds(pick: Int[Array, " G"], count: int) -> Bool[Array, " G"]:
+    """Whether each picker holds a particle: it names one, and no earlier picker does."""
     earlier = jnp.tril(pick[:, None] == pick[None, :], k=-1).any(axis=1)
-    return (pick != NONE) & ~earlier
+    return (pick >= 0) & (pick < count) & ~earlier
 
 
 def _allowed(
