@@ -142,9 +142,10 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     }
     if any(left.values()):
         _run_all(study, models, left, folder, console)
-    order = {(name, *run): i for i, (name, run) in enumerate(
-        (name, run) for name in study.tasks for run in study.runs(name))}
-    rows = sorted(records.read_rows(folder / ROWS_FILE), key=lambda row: order[_identity(row)])
+    order = [(name, *run) for name in study.tasks for run in study.runs(name)]
+    rows = sorted(
+        records.read_rows(folder / ROWS_FILE), key=lambda row: order.index(_identity(row))
+    )
     return {
         "environment": records.environment(),
         "models": [_model_row(name, model) for name, model in models.items()],
@@ -172,8 +173,12 @@ def _run_all(
             f"{len(left[name])} runs of about {seconds[name] / len(left[name]):.1f} s"
         )
     console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for what is left")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-               TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console) as progress:
         for name, planner in planners.items():
             bar = progress.add_task(name, total=len(left[name]) * planner.config.num_iterations)

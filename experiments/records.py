@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 CONFIG_FILE = "config.json"
 PACKAGES = ("jaxsimp", "jax", "jaxlib", "numpy", "scipy", "optax", "libigl", "proxsuite")
@@ -33,7 +34,7 @@ def environment() -> dict[str, Any]:
         else os.cpu_count(),
         "device": device.device_kind,
         "num_devices": jax.device_count(),
-        "x64": bool(jax.config.jax_enable_x64),
+        "x64": jnp.result_type(float) == jnp.float64,
     }
 
 

@@ -35,12 +35,15 @@ def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     _save(viz.plot_model_errors(models), figures / "model_errors.png")
     shown = {name: (task.body, task.goal, models[name]) for name, task in tasks.items()}
     _save(viz.plot_models(shown), figures / "models.png")
-    _save(viz.plot_costs({name: _costs(_of(rows, task=name)) for name in tasks}),
-          figures / "costs.png")
+    _save(
+        viz.plot_costs({name: _costs(_of(rows, task=name)) for name in tasks}),
+        figures / "costs.png",
+    )
     for name, task in tasks.items():
         plans = _typical_plans(_of(rows, task=name), folder)
         seed = _typical_seed(_of(rows, task=name))
-        figure = viz.plot_executions(task.body, task.episode_fn(seed).goal, plans, name)
+        goal = np.asarray(task.episode_fn(seed).goal)
+        figure = viz.plot_executions(task.body, goal, plans, name)
         _save(figure, figures / f"plans_{name}.png")
     (folder / "report.md").write_text(_report(study, summary))
 
@@ -142,11 +145,22 @@ def _model_table(models: list[dict[str, Any]]) -> list[str]:
     return _table(
         ["task", "key points", "particles", "model error (mm)", "threshold (mm)", "method"],
         (
-            [m["task"], len(m["key_points"]), m["key_points"], f"{1e3 * m['errors'][-1]:.2f}",
-             f"{1e3 * m['threshold']:.1f}", m["method"]]
+            [
+                m["task"],
+                len(m["key_points"]),
+                m["key_points"],
+                f"{1e3 * _error(m):.2f}",
+                f"{1e3 * m['threshold']:.1f}",
+                m["method"],
+            ]
             for m in models
         ),
     )
+
+
+def _error(model: dict[str, Any]) -> float:
+    """Error of the chosen size, metres."""
+    return model["errors"][model["sizes"].index(len(model["key_points"]))]
 
 
 def _run_table(rows: Rows) -> list[str]:
@@ -156,19 +170,29 @@ def _run_table(rows: Rows) -> list[str]:
             scores = np.array([_score(run) for run in runs])
             successes = sum(run["success"] for run in runs)
             low, high = success_interval(successes, len(runs))
-            table.append([
-                task,
-                method,
-                f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})",
-                f"{successes}/{len(runs)} ({low:.2f} to {high:.2f})",
-                runs[0]["rollouts"],
-                sum(run["non_finite"] for run in runs),
-                f"{np.median([run['plan_seconds'] for run in runs]):.1f}",
-                f"{sum(run['compile_seconds'] for run in runs):.1f}",
-            ])
+            table.append(
+                [
+                    task,
+                    method,
+                    f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})",
+                    f"{successes}/{len(runs)} ({low:.2f} to {high:.2f})",
+                    runs[0]["rollouts"],
+                    sum(run["non_finite"] for run in runs),
+                    f"{np.median([run['plan_seconds'] for run in runs]):.1f}",
+                    f"{sum(run['compile_seconds'] for run in runs):.1f}",
+                ]
+            )
     return _table(
-        ["task", "method", "score: median (range)", "success rate (95 %)", "rollouts a plan",
-         "not finite", "seconds to plan", "compile seconds, all runs"],
+        [
+            "task",
+            "method",
+            "score: median (range)",
+            "success rate (95 %)",
+            "rollouts a plan",
+            "not finite",
+            "seconds to plan",
+            "compile seconds, all runs",
+        ],
         table,
     )
 

@@ -151,10 +151,8 @@ def make_task(name: str, resolution: int | None = None, *, quick: bool = False) 
 ROPE_LENGTH = 0.5375
 """Rest length of SoftGym's rope, metres; the straight goal is `SLACK` of it long."""
 SLACK = 0.5 / ROPE_LENGTH
-
-
-def _rope_task(name: str, body: Body, **fields: object) -> Task:
-    return Task(name=name, body=body, limits=(0.15, 0.15, 0.15), **fields)
+ROPE_LIMITS = (0.15, 0.15, 0.15)
+"""Largest displacement of one action along x, y, z, metres."""
 
 
 @register("rope_straightening", full=41, quick=21)
@@ -171,10 +169,11 @@ def rope_straightening(resolution: int) -> Task:
         goal = jnp.asarray(episode.goal)
         return jnp.abs(_distance(position[0] - position[-1]) - _distance(goal[0] - goal[-1]))
 
-    return _rope_task(
-        "rope_straightening",
-        body,
+    return Task(
+        name="rope_straightening",
+        body=body,
         goal=goal,
+        limits=ROPE_LIMITS,
         episode_fn=lambda seed: Episode(crumple(body, seed), goal),
         cost_fn=cost,
     )
@@ -198,10 +197,11 @@ def rope_folding(resolution: int) -> Task:
     def cost(episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
         return matching_distance(position[chosen], jnp.asarray(episode.goal)[chosen])
 
-    return _rope_task(
-        "rope_folding",
-        body,
+    return Task(
+        name="rope_folding",
+        body=body,
         goal=goal,
+        limits=ROPE_LIMITS,
         episode_fn=lambda seed: Episode(start, goal),
         cost_fn=cost,
     )

@@ -1,7 +1,7 @@
 """Pictures of bodies, models, searches and executed plans. matplotlib is imported when called."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -10,8 +10,8 @@ from jaxsimp.body import Body
 from jaxsimp.simplify import KeyPoints
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from mpl_toolkits.mplot3d import Axes3D
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 """Distinct for the colour-blind (Okabe and Ito)."""
@@ -30,8 +30,8 @@ def plot_model_errors(models: Mapping[str, KeyPoints]) -> "Figure":
         axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
         axes.axhline(model.threshold * 1e3, color=GOAL_COLOR, ls="--", label="threshold")
         axes.plot(
-            model.sizes[-1],
-            model.errors[-1] * 1e3,
+            len(model),
+            model.error * 1e3,
             "o",
             ms=11,
             mfc="none",
@@ -85,8 +85,9 @@ def plot_costs(
             axes.plot(iteration, mean, color=color, ls=line, label=method)
             axes.fill_between(iteration, mean - half, mean + half, color=color, alpha=0.15, lw=0)
         axes.set(title=_title(name), xlabel="iteration", ylabel=ylabel)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        axes.set_ylim(0, 1.15 * max(np.nanmax(runs.mean(axis=0)) for runs in methods.values()))
+        axes.locator_params(axis="x", integer=True)
+        means = np.concatenate([runs.mean(axis=0) for runs in methods.values()])
+        axes.set_ylim(0, 1.15 * means[np.isfinite(means)].max(initial=1e-9))
         axes.margins(x=0.02)
     panels[0].legend(frameon=False, fontsize="small")
     return figure
@@ -150,8 +151,10 @@ def plot_executions(
     return figure
 
 
-def draw_body(axes: "Axes", body: Body, positions: Positions, color: str) -> None:
+def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> None:
     """Draw a rope as a line, a surface as shaded triangles, into 3-D axes.
+
+    A body whose motion failed, with positions that are not finite, is left out.
 
     Args:
         axes: of a 3-D projection.
@@ -159,6 +162,8 @@ def draw_body(axes: "Axes", body: Body, positions: Positions, color: str) -> Non
         positions: shape (N, 3), metres.
         color: of the body.
     """
+    if not np.isfinite(positions).all():
+        return
     if len(body.faces):
         axes.plot_trisurf(
             *positions.T,
@@ -182,9 +187,10 @@ def _outline(body: Body) -> list[np.ndarray]:
     return [grid[0], grid[-1], grid[:, 0], grid[:, -1]]
 
 
-def _frame(axes: "Axes", shown: Sequence[Positions], zoom: float = 1.25) -> None:
+def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.25) -> None:
     """Equal scales around everything shown, seen from above at an angle, without axes."""
     points = np.concatenate(shown)
+    points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
     low[2], high[2] = 0.0, max(high[2], 1e-3)
     span = np.maximum(high - low, 0.05 * np.ptp(points))
@@ -199,7 +205,7 @@ def _frame(axes: "Axes", shown: Sequence[Positions], zoom: float = 1.25) -> None
     axes.set_axis_off()
 
 
-def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Figure", list["Axes"]]:
+def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Figure", list[Any]]:
     """A figure of one panel an item, two a row."""
     import matplotlib.pyplot as plt
 

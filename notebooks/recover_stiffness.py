@@ -48,6 +48,8 @@ from jaxsimp.dynamics import (
 )
 
 SMALL = os.environ.get("JAXSIMP_NOTEBOOK_SIZE") == "small"  # the size that the tests run
+# Optimised less, gradients compile three times as fast, and here there is little to run.
+jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
 num_particles, observations = (8, 6) if SMALL else (21, 12)
 
 # %% [markdown]
@@ -76,7 +78,7 @@ def trajectory(log_factor):
 
 
 true_factor = 0.4
-observed = jax.jit(trajectory)(jnp.log(true_factor))
+observed = jit(trajectory)(jnp.log(true_factor))
 
 # %% [markdown]
 # The unknown is the logarithm of a factor on the stiffness: steps are then relative, and the
@@ -89,8 +91,7 @@ def descend(loss_fn, guess, learning_rate, steps):
     """Adam with a learning rate that falls to zero; all guesses and losses on the way."""
     optimizer = optax.adam(optax.cosine_decay_schedule(learning_rate, steps))
 
-    # Optimised less, it compiles three times as fast, and there is not much to run.
-    @partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
+    @jit
     def run(guess):
         def step(carry, _):
             guess, state = carry
@@ -108,7 +109,7 @@ def misfit(log_factor):
     return jnp.mean(jnp.sum((trajectory(log_factor) - observed) ** 2, axis=-1))
 
 
-steps = 200
+steps = 150 if SMALL else 200
 found, log_factors, misfits = descend(misfit, jnp.zeros(()), learning_rate=0.15, steps=steps)
 stretch = body.stiffness.max()
 print(f"true stiffness  {stretch * true_factor:.2f} N/m")
@@ -138,7 +139,7 @@ def final_shape(displacement):
 
 
 true_displacement = jnp.array([-0.15, 0.12, 0.08])
-wanted = jax.jit(final_shape)(true_displacement)
+wanted = jit(final_shape)(true_displacement)
 
 
 def distance_to_goal(displacement):
@@ -165,10 +166,10 @@ middle.semilogy(1e3 * np.sqrt(distances), label="shape wanted")
 middle.set(xlabel="step of gradient descent", ylabel="RMS distance (mm)", title="Losses")
 middle.legend(frameon=False)
 
-reached = jax.jit(final_shape)(plan)
+reached = jit(final_shape)(plan)
 for shape, style, label in [
     (on_table.position, "C7-", "start"),
-    (jax.jit(final_shape)(guess), "C1-", "first guess"),
+    (jit(final_shape)(guess), "C1-", "first guess"),
     (wanted, "k--", "wanted"),
     (reached, "C0.", "reached"),
 ]:

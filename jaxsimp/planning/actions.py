@@ -48,7 +48,10 @@ class ActionSpace:
 class Encoding(Protocol):
     """What CEM needs to know of a distribution over plans."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What it is called in `ENCODINGS`."""
+        ...
 
     def init(self, space: ActionSpace, spread: float) -> PyTree[Any]:
         """The distribution before any sample; `spread` is the deviation of displacements."""

@@ -38,7 +38,7 @@ class CEMConfig:
     num_iterations: int = 15
     population: int = 128
     elite_fraction: float = 0.1
-    smoothing: float = 0.1
+    smoothing: float = 0.05
     initial_spread: float = 0.7
     keep_best: bool = True
     returns: Literal["best", "mean"] = "best"
@@ -126,6 +126,7 @@ def search(
         best_costs.append(float(best.costs[0]))
         elite_costs.append(float(elites.costs.mean()))
         on_iteration()
+    assert best is not None  # there is at least one iteration
     num_rollouts = config.num_iterations * config.population
     if config.returns == "mean":
         actions = encoding.decode(space, encoding.mean(space, distribution))

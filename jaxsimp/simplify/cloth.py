@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions, check_goal
 from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
-from jaxsimp.simplify.keypoints import KeyPoints
+from jaxsimp.simplify.keypoints import KeyPoints, smallest_fit
 
 MIN_SIZE = 4  # two triangles, where the paper starts
 # Weights of the planes of boundary edges and turns, for a mesh scaled to half an extent of 1,
@@ -65,15 +65,14 @@ def simplify_cloth(
     meshes = collapse_sequence(goal, follow_creases(body, goal), max_size)
     original = Surface(goal, body.faces)
     sampling = max(threshold / 10, body.spacing / 8)
-    errors: dict[int, float] = {}
-    for size in sorted(meshes):
-        model = Surface(goal, meshes[size])
-        errors[size] = hausdorff_distance(original, model, sampling)
-        if errors[size] < threshold:
-            break
-    else:
+
+    def error(size: int) -> float:
+        return hausdorff_distance(original, Surface(goal, meshes[size]), sampling)
+
+    size, errors = smallest_fit(error, sorted(meshes), threshold)
+    if size is None:
         raise ValueError(_no_fit(errors, threshold, max_size))
-    particles, elements = np.unique(model.faces, return_inverse=True)
+    particles, elements = np.unique(meshes[size], return_inverse=True)
     return KeyPoints(
         particles=particles,
         positions=goal[particles],

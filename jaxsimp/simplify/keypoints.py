@@ -1,5 +1,6 @@
 """Key points: the few particles that a goal makes worth grasping."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,8 @@ class KeyPoints:
             indices into `particles`.
         num_particles: number of particles of the body, `N`.
         method: what found them.
-        sizes: numbers of key points tried, in ascending order; the last one fits.
+        sizes: numbers of key points tried, in ascending order: up to the first that fits, and
+            a few beyond, which show what more key points would buy.
         errors: error of the model at each size, metres.
         threshold: error below which a model fits, metres.
     """
@@ -40,3 +42,39 @@ class KeyPoints:
         mask = np.zeros(self.num_particles, dtype=bool)
         mask[self.particles] = True
         return mask
+
+    @property
+    def error(self) -> float:
+        """Error of the model, metres."""
+        return self.errors[self.sizes.index(len(self))]
+
+
+SIZES_BEYOND = 3
+"""Sizes tried after the first that fits."""
+
+
+def smallest_fit(
+    error_fn: Callable[[int], float], sizes: Iterable[int], threshold: float
+) -> tuple[int | None, dict[int, float]]:
+    """The first size whose error is below the threshold, and the errors of all sizes tried.
+
+    Sizes are tried one by one, since errors need not fall with every further key point.
+
+    Args:
+        error_fn: error of the model of a size, metres.
+        sizes: in ascending order.
+        threshold: metres.
+
+    Returns:
+        The size, None if no model fits, and the errors by size, `SIZES_BEYOND` further than
+        needed.
+    """
+    errors: dict[int, float] = {}
+    fitting: list[int] = []
+    for size in sizes:
+        errors[size] = error_fn(size)
+        if fitting or errors[size] < threshold:
+            fitting.append(size)
+        if len(fitting) > SIZES_BEYOND:
+            break
+    return (fitting[0] if fitting else None), errors

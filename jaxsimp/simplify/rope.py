@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions, check_goal
 from jaxsimp.simplify import qp
-from jaxsimp.simplify.keypoints import KeyPoints
+from jaxsimp.simplify.keypoints import KeyPoints, smallest_fit
 
 
 def simplify_rope(
@@ -55,29 +55,28 @@ def simplify_rope(
     _check_options(body, threshold, max_size)
     lower, upper = _box(body, above_table, workspace)
     constrained = fixed_ends or bool(np.isfinite([lower, upper]).any())
-    errors: list[float] = []
-    for size in range(2, min(max_size, body.num_particles) + 1):
+
+    def fit(size: int) -> tuple[np.ndarray, float]:
         if constrained:
-            positions, error = _fit_one_constrained(goal, size, lower, upper, fixed_ends)
-        else:
-            positions, error = _fit_one(goal, size)
-        errors.append(error)
-        if error < threshold:
-            break
-    else:
+            return _fit_one_constrained(goal, size, lower, upper, fixed_ends)
+        return _fit_one(goal, size)
+
+    sizes = range(2, min(max_size, body.num_particles) + 1)
+    size, errors = smallest_fit(lambda size: fit(size)[1], sizes, threshold)
+    if size is None:
         raise ValueError(
-            f"no fit of up to {len(errors) + 1} key points is within the threshold of "
-            f"{threshold:.3g} m: the best is off by {min(errors):.3g} m; raise threshold or "
-            f"max_size"
+            f"no fit of up to {sizes[-1]} key points is within the threshold of "
+            f"{threshold:.3g} m: the best is off by {min(errors.values()):.3g} m; raise "
+            f"threshold or max_size"
         )
     return KeyPoints(
         particles=breakpoint_particles(body.num_particles, size),
-        positions=positions,
+        positions=fit(size)[0],
         elements=np.stack([np.arange(size - 1), np.arange(1, size)], axis=1),
         num_particles=body.num_particles,
         method="uniform breakpoints",
-        sizes=tuple(range(2, size + 1)),
-        errors=tuple(errors),
+        sizes=tuple(errors),
+        errors=tuple(errors.values()),
         threshold=threshold,
     )
 

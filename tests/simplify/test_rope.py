@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsimp import body, goals
 from jaxsimp.simplify import simplify, simplify_rope
+from jaxsimp.simplify.keypoints import SIZES_BEYOND
 from jaxsimp.simplify.qp import Status
 from jaxsimp.simplify.rope import (
     breakpoint_particles,
@@ -178,9 +179,10 @@ def test_polylines_of_equal_legs_give_their_corners(corners, particles):
     goal = goals.polyline(ROPE, corners)
     points = simplify_rope(ROPE, goal)
     assert points.particles.tolist() == particles
-    assert points.sizes == tuple(range(2, len(particles) + 1))
+    assert points.sizes == tuple(range(2, len(particles) + 1 + SIZES_BEYOND))
     assert points.positions[:, :2] == pytest.approx(corners, abs=10 * SINGLE)
-    assert points.errors[-1] < points.threshold <= min(points.errors[:-1])
+    before = points.errors[: points.sizes.index(len(particles))]
+    assert points.error < points.threshold <= min(before)
 
 
 def test_every_size_is_tried_since_errors_are_not_monotone():
@@ -190,7 +192,8 @@ def test_every_size_is_tried_since_errors_are_not_monotone():
     assert errors[2] < SINGLE
     assert errors[1] > 1e-3
     points = simplify_rope(ROPE, goal, threshold=1e-4)
-    assert points.sizes == (2, 3)
+    assert points.sizes == (2, 3, 4, 5, 6)
+    assert len(points) == 3
 
 
 def test_far_from_the_origin_float32_is_as_good():
