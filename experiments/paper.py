@@ -52,7 +52,7 @@ _PAPER = CEMConfig(
     num_iterations=20, smoothing=0.0, initial_spread=0.5**0.5, keep_best=False, returns="mean"
 )
 BUDGETS = {
-    "default": Budget(rope=CEMConfig(num_iterations=24), cloth=CEMConfig(num_iterations=18)),
+    "default": Budget(rope=CEMConfig(num_iterations=24), cloth=CEMConfig(num_iterations=24)),
     "paper": Budget(
         rope=dataclasses.replace(_PAPER, population=70),
         cloth=dataclasses.replace(_PAPER, population=333),

@@ -135,7 +135,7 @@ def cloth(
     shear_stiffness: float = 0.5,
     bend_stiffness: float = 0.1,
     damping: float = 1e-3,
-    drag: float = 1.0,
+    drag: float = 3.0,
     friction: float = 0.5,
     radius: float = 0.002,
 ) -> Body:

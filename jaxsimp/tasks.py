@@ -309,7 +309,7 @@ def _fold_task(
         episode_fn=episode,
         cost_fn=cost,
         limits=(0.2, 0.2, 0.2),
-        num_actions=3,
+        num_actions=2,
         action_seconds=0.25,
     )
 

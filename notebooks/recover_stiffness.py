@@ -109,7 +109,7 @@ def misfit(log_factor):
     return jnp.mean(jnp.sum((trajectory(log_factor) - observed) ** 2, axis=-1))
 
 
-steps = 150 if SMALL else 200
+steps = 150
 found, log_factors, misfits = descend(misfit, jnp.zeros(()), learning_rate=0.15, steps=steps)
 stretch = body.stiffness.max()
 print(f"true stiffness  {stretch * true_factor:.2f} N/m")
@@ -119,26 +119,27 @@ print(f"recovered       {stretch * float(jnp.exp(found)):.2f} N/m")
 # %% [markdown]
 # ## 2. Which displacement makes this shape?
 #
-# Now the rope lies on the table. A picker grasps its last particle, moves it, and lets go; the rope
-# follows and friction holds what has landed. The shape that we want was made by a displacement that
-# we pretend not to know, and we start from a much smaller one.
+# Now the rope lies on the table. A picker grasps its last particle, carries it 8 cm up and
+# somewhere to the side, and lets go; the rope follows, and friction holds what has landed. The
+# shape that we want was made by a displacement that we pretend not to know. We start from a much
+# smaller one.
 
 # %%
-carry = make_pickers((0.3, 0.3, 0.3), steps=round(0.3 / time_step))
+carry = make_pickers((0.3, 0.3, 0.3), steps=round(0.2 / time_step))
 on_table = at_rest(goals.flat(body))
 
 
 def final_shape(displacement):
     """The rope after the picker has moved and then let go."""
-    nothing = jnp.zeros(3)
+    up = jnp.append(displacement, 0.08)
     actions = Actions(
         pick=jnp.array([[num_particles - 1], [NONE]]),
-        displacement=jnp.stack([displacement, nothing])[:, None],
+        displacement=jnp.stack([up, jnp.zeros(3)])[:, None],
     )
     return rollout(simulation, carry, on_table, actions)[0].position
 
 
-true_displacement = jnp.array([-0.15, 0.12, 0.08])
+true_displacement = jnp.array([-0.15, 0.12])
 wanted = jit(final_shape)(true_displacement)
 
 
@@ -146,7 +147,7 @@ def distance_to_goal(displacement):
     return jnp.mean(jnp.sum((final_shape(displacement) - wanted) ** 2, axis=-1))
 
 
-guess = jnp.array([-0.05, 0.03, 0.04])
+guess = jnp.array([-0.05, 0.03])
 plan, _, distances = descend(distance_to_goal, guess, learning_rate=0.02, steps=steps)
 print("true displacement (cm) ", np.round(100 * np.asarray(true_displacement), 2))
 print("recovered              ", np.round(100 * np.asarray(plan), 2))
@@ -179,12 +180,12 @@ right.legend(frameon=False, fontsize="small")
 plt.show()
 
 # %% [markdown]
-# The checks. The stiffness must come back to 1 %. Of the displacement the final shape tells less,
-# since different ways lead to nearly the same shape (the height, above all): what must come back
-# is the shape, to a tenth of the spacing of the particles, from a guess that missed it widely.
+# The checks, with room for another machine's rounding: the stiffness to 1 %, the displacement and
+# the shape to half a millimetre.
 
 # %%
-assert abs(float(jnp.exp(found)) / true_factor - 1) < 0.01, "the stiffness was not recovered"
 missed = float(jnp.sqrt(jnp.mean(jnp.sum((reached - wanted) ** 2, axis=-1))))
-assert missed < body.spacing / 10, f"the shape was missed by {1e3 * missed:.2f} mm"
-assert missed < 0.1 * float(jnp.sqrt(distances[0])), "hardly better than the first guess"
+print(f"shape missed by {1e3 * missed:.3f} mm, at first by {1e3 * distances[0] ** 0.5:.0f} mm")
+assert abs(float(jnp.exp(found)) / true_factor - 1) < 0.01, "the stiffness was not recovered"
+assert float(jnp.max(jnp.abs(plan - true_displacement))) < 5e-4, "the action was not recovered"
+assert missed < 5e-4, "the shape was not reached"

@@ -38,7 +38,7 @@ class CEMConfig:
     num_iterations: int = 15
     population: int = 128
     elite_fraction: float = 0.1
-    smoothing: float = 0.05
+    smoothing: float = 0.1
     initial_spread: float = 0.7
     keep_best: bool = True
     returns: Literal["best", "mean"] = "best"
