@@ -110,6 +110,18 @@ def test_json_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert json.loads(path.read_text()) == {"old": 1}
 
 
+def test_json_is_never_written_under_its_own_name(tmp_path, monkeypatch):
+    # A kill in the middle of a write finds another name there.
+    written, write_text = [], Path.write_text
+    monkeypatch.setattr(
+        Path, "write_text", lambda self, text: written.append(self) or write_text(self, text)
+    )
+    write_json(tmp_path / "summary.json", {"new": 2})
+    assert written
+    assert tmp_path / "summary.json" not in written
+    assert names(tmp_path) == ["summary.json"]
+
+
 def test_json_that_cannot_be_written_leaves_the_old(tmp_path):
     path = tmp_path / "summary.json"
     write_json(path, {"old": 1})

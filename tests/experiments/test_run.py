@@ -62,8 +62,9 @@ def test_summary_has_its_schema(folder):
     for model in summary["models"]:
         assert model["method"]
         assert len(model["sizes"]) == len(model["errors"]) > 0
-        assert model["errors"][-1] < model["threshold"]
-        assert len(model["key_points"]) == model["sizes"][-1]
+        # The first size that fits is the one chosen; others are there to be shown.
+        fits = [error < model["threshold"] for error in model["errors"]]
+        assert len(model["key_points"]) == model["sizes"][fits.index(True)]
         particles = make_task(model["task"], 9).body.num_particles
         assert set(model["key_points"]) <= set(range(particles))
 
@@ -122,7 +123,8 @@ def test_figures_and_report_are_there(folder):
         picture = matplotlib.image.imread(folder / "figures" / f"{name}.png")
         assert min(picture.shape[:2]) > 200
         # Not blank: some, but not most of it, is other than its commonest colour.
-        colours, counts = np.unique(picture.reshape(-1, 4), axis=0, return_counts=True)
+        grey = picture[..., :3].sum(axis=-1)
+        colours, counts = np.unique(grey, return_counts=True)
         assert len(colours) > 10
         assert 1 - counts.max() / counts.sum() > 0.005
         assert f"(figures/{name}.png)" in report
