@@ -82,7 +82,7 @@ def test_a_flat_sheet_has_its_corners():
 @settings(max_examples=10)
 def test_key_points_are_particles_where_the_goal_has_them(seed):
     goal = crumpled(np.random.default_rng(seed))
-    points = simplify_cloth(cloth(7), goal, threshold=0.04)
+    points = simplify_cloth(cloth(7), goal, threshold=0.04, max_size=49)  # all of them fit
     assert np.array_equal(points.positions, goal[points.particles])
     assert (np.diff(points.particles) > 0).all()
     assert np.array_equal(np.unique(points.elements), np.arange(len(points)))
