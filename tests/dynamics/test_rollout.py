@@ -447,8 +447,10 @@ def test_nothing_sinks_through_the_table():
 
     @jax.jit
     def lowest(state, actions):
-        observe_fn = lambda state: state.position[:, 2].min()  # noqa: E731
-        return rollout(simulation, pickers, state, actions, observe_fn)[1]
+        def height(state):
+            return state.position[:, 2].min()
+
+        return rollout(simulation, pickers, state, actions, height)[1]
 
     @given(seed=st.integers(0, 2**32 - 1), speed=st.floats(0.0, 5.0), height=st.floats(0.0, 0.2))
     def check(seed, speed, height):
