@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 def table_contact(
     height: Float[Array, " N"],
-    velocity: Float[Array, "3 N"],
+    velocity: list[Float[Array, " N"]],
     friction: Float[Array, ""],
     time_step: Float[Array, ""],
 ) -> Float[Array, "3 N"]:
@@ -19,12 +19,12 @@ def table_contact(
 
     Args:
         height: of the particles above their resting height, metres.
-        velocity: that they would have without contact, metres per second.
+        velocity: along x, y and z, that they would have without contact, metres per second.
         friction: Coulomb coefficient.
         time_step: seconds.
     """
-    x, y, z = velocity[0], velocity[1], velocity[2]
-    normal = jnp.maximum(z, -height / time_step)
+    x, y, z = velocity
+    normal = jnp.maximum(z, -height * (1.0 / time_step))
     squared = x * x + y * y
     # The floor keeps the gradient finite at rest; 1e-6 m/s is below any sliding of interest.
     slowdown = friction * (normal - z) * jax.lax.rsqrt(jnp.maximum(squared, 1e-12))

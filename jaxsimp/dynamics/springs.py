@@ -75,8 +75,8 @@ def make_springs(body: Body) -> Springs:
 
 def spring_forces(
     springs: Springs, position: Float[Array, "3 NHH"], velocity: Float[Array, "3 NHH"]
-) -> Float[Array, "3 N"]:
-    """Forces of all springs on the particles, newtons, shape (3, N).
+) -> list[Float[Array, " N"]]:
+    """Forces of all springs on the particles along x, y and z, newtons, each of shape (N,).
 
     Hooke's law with damping along the spring: the force on `i` towards `j` is
     `k (r - L) + c dr/dt`. Ends closer than `springs.shortest` are treated as that far apart
@@ -88,18 +88,24 @@ def spring_forces(
         position: with halo, metres.
         velocity: with halo, metres per second.
     """
+    tensions = [_tension(springs, row, position, velocity) for row in range(len(springs.offsets))]
+    return [_pull(springs, tensions, position[axis]) for axis in range(3)]
+
+
+def _pull(
+    springs: Springs, tensions: list[Float[Array, " HN"]], position: Float[Array, " NHH"]
+) -> Float[Array, " N"]:
+    """Force along one axis: each spring pulls at the particles at its either end."""
     halo = springs.halo
-    end = position.shape[1] - halo
+    end = len(position) - halo
     here = slice(halo, end)
-    force = jnp.zeros_like(position[:, here])
-    for row, offset in enumerate(springs.offsets):
-        tension = _tension(springs, row, position, velocity)
-        after = slice(halo + offset, end + offset)
-        before = slice(halo - offset, end - offset)
+    force = jnp.zeros_like(position[here])
+    for offset, tension in zip(springs.offsets, tensions, strict=True):
+        after, before = slice(halo + offset, end + offset), slice(halo - offset, end - offset)
         force = (
             force
-            + tension[None, here] * (position[:, after] - position[:, here])
-            - tension[None, before] * (position[:, here] - position[:, before])
+            + tension[here] * (position[after] - position[here])
+            - tension[before] * (position[here] - position[before])
         )
     return force
 

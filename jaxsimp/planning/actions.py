@@ -177,10 +177,12 @@ class Categorical:
     ) -> tuple[Int[Array, "num T G"], Float[Array, "num T G 3"]]:
         """Choices and displacements."""
         key_choice, key_move = jax.random.split(key)
-        frequency = distribution.frequency
-        choice = jax.random.categorical(
-            key_choice, jnp.log(frequency), shape=(num, *frequency.shape[:-1])
-        )
+        # By the inverse of the cumulative distribution: one random number a draw, where
+        # `jax.random.categorical` takes one a candidate.
+        cumulative = jnp.cumsum(distribution.frequency, axis=-1)
+        uniform = jax.random.uniform(key_choice, (num, *cumulative.shape[:-1]))
+        drawn = (uniform * cumulative[None, ..., -1])[..., None]
+        choice = jnp.sum(drawn >= cumulative[None, ..., :-1], axis=-1)
         return choice, distribution.displacement.sample(key_move, num)
 
     def decode(

@@ -1,8 +1,8 @@
 """How a population of rollouts is laid on this machine: the one place that decides it.
 
-On a CPU it is fastest to give every core its share of the population, and to run that share in
-chunks small enough for their state to stay in the cache, each through its whole rollout. On a
-GPU the whole population in one `vmap` is. See `Layout`.
+On a CPU it is fastest to give every core its share of the population, and to run each sample of
+it through its whole rollout by itself, its state in the cache. On a GPU the whole population in
+one `vmap` is. See `Layout`.
 """
 
 import os
@@ -24,7 +24,8 @@ class Layout:
     """A population split into one share a worker, each run in chunks of samples.
 
     Attributes:
-        chunk_size: samples batched by `vmap`; the chunks of a share run one after another.
+        chunk_size: samples batched by `vmap`, or 1 for none; the chunks of a share run one after
+            another.
         num_workers: host threads that run a share each; they take the devices in turn.
 
     Raises:
@@ -42,17 +43,12 @@ class Layout:
             )
 
 
-CPU_CHUNK_SIZE = 8
-"""Samples a chunk on a CPU: measured best from 41 to 625 particles, by 1.6 to 4 times over 1."""
-
-
 def default_layout(population: int) -> Layout:
-    """The layout measured to be fastest: small chunks on every core, or one `vmap` a device."""
+    """The layout measured to be fastest: sample by sample on every core, or a `vmap` a device."""
     devices = jax.local_devices()
-    on_cpu = devices[0].platform == "cpu"
-    workers = max(_num_cores(), len(devices)) if on_cpu else len(devices)
-    share = -(-population // workers)
-    return Layout(chunk_size=min(CPU_CHUNK_SIZE, share) if on_cpu else share, num_workers=workers)
+    if devices[0].platform == "cpu":
+        return Layout(chunk_size=1, num_workers=max(_num_cores(), len(devices)))
+    return Layout(chunk_size=-(-population // len(devices)), num_workers=len(devices))
 
 
 def _num_cores() -> int:
