@@ -10,7 +10,7 @@ def table_contact(
     velocity: list[Float[Array, " N"]],
     friction: Float[Array, ""],
     time_step: Float[Array, ""],
-) -> Float[Array, "3 N"]:
+) -> list[Float[Array, " N"]]:
     """Velocities after contact: no particle sinks into the table, and Coulomb friction acts.
 
     The normal impulse is the one that leaves a particle on the table at the end of the step
@@ -29,4 +29,4 @@ def table_contact(
     # The floor keeps the gradient finite at rest; 1e-6 m/s is below any sliding of interest.
     slowdown = friction * (normal - z) * jax.lax.rsqrt(jnp.maximum(squared, 1e-12))
     kept = jnp.maximum(0.0, 1.0 - slowdown)
-    return jnp.stack([x * kept, y * kept, normal])
+    return [x * kept, y * kept, normal]

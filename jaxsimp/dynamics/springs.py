@@ -9,6 +9,7 @@ Inside a simulation positions and velocities are (3, N + 2 H): x, y, z as rows, 
 `H` inert particles, the largest offset, at either end, so that every shift stays in bounds.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from functools import partial
 
@@ -73,10 +74,10 @@ def make_springs(body: Body) -> Springs:
     )
 
 
-def spring_forces(
+def spring_tensions(
     springs: Springs, position: Float[Array, "3 NHH"], velocity: Float[Array, "3 NHH"]
-) -> list[Float[Array, " N"]]:
-    """Forces of all springs on the particles along x, y and z, newtons, each of shape (N,).
+) -> list[Float[Array, " HN"]]:
+    """Force of each spring over the distance of its ends, newtons per metre, by offset.
 
     Hooke's law with damping along the spring: the force on `i` towards `j` is
     `k (r - L) + c dr/dt`. Ends closer than `springs.shortest` are treated as that far apart
@@ -88,41 +89,120 @@ def spring_forces(
         position: with halo, metres.
         velocity: with halo, metres per second.
     """
-    tensions = [_tension(springs, row, position, velocity) for row in range(len(springs.offsets))]
-    return [_pull(springs, tensions, position[axis]) for axis in range(3)]
+    tensions = []
+    for row in range(len(springs.offsets)):
+        along, speed = _difference(springs, row, position), _difference(springs, row, velocity)
+        squared = jnp.maximum(_dot(along, along), springs.shortest**2)
+        stretch = squared - springs.rest_length[row] * jnp.sqrt(squared)
+        force = springs.stiffness[row] * stretch + springs.damping[row] * _dot(along, speed)
+        # The division comes last because XLA holds it too dear to repeat: it keeps the tension
+        # in memory, where it would otherwise compute it again for each of its six uses.
+        tensions.append(force / squared)
+    return tensions
+
+
+def pull(
+    springs: Springs, weights: list[Float[Array, " HN"]], values: Float[Array, "3 NHH"]
+) -> list[Float[Array, " N"]]:
+    """Along each axis: the sum over a particle's springs of `weight (value_other - value_self)`.
+
+    The forces of the springs, newtons, when the weights are tensions and the values positions.
+
+    Args:
+        springs: of the body.
+        weights: of the springs, by offset.
+        values: of the particles, with halo.
+    """
+    return [_pull(springs, weights, values[axis]) for axis in range(3)]
 
 
 def _pull(
-    springs: Springs, tensions: list[Float[Array, " HN"]], position: Float[Array, " NHH"]
+    springs: Springs, weights: list[Float[Array, " HN"]], values: Float[Array, " NHH"]
 ) -> Float[Array, " N"]:
-    """Force along one axis: each spring pulls at the particles at its either end."""
     halo = springs.halo
-    end = len(position) - halo
+    end = len(values) - halo
     here = slice(halo, end)
-    force = jnp.zeros_like(position[here])
-    for offset, tension in zip(springs.offsets, tensions, strict=True):
+    total = jnp.zeros_like(values[here])
+    for offset, weight in zip(springs.offsets, weights, strict=True):
         after, before = slice(halo + offset, end + offset), slice(halo - offset, end - offset)
-        force = (
-            force
-            + tension[here] * (position[after] - position[here])
-            - tension[before] * (position[here] - position[before])
+        total = (
+            total
+            + weight[here] * (values[after] - values[here])
+            - weight[before] * (values[here] - values[before])
         )
-    return force
+    return total
 
 
-def _tension(
-    springs: Springs, row: int, position: Float[Array, "3 NHH"], velocity: Float[Array, "3 NHH"]
-) -> Float[Array, " HN"]:
-    """Force per distance of the ends, newtons per metre, of the springs of one offset."""
+def spring_forces_vjp(
+    springs: Springs,
+    tensions: list[Float[Array, " HN"]],
+    position: Float[Array, "3 NHH"],
+    velocity: Float[Array, "3 NHH"],
+    force_bar: Float[Array, "3 NHH"],
+) -> tuple[Springs, list[Float[Array, " N"]], list[Float[Array, " N"]]]:
+    """Cotangents of springs, positions and velocities for one of the spring forces.
+
+    Let `d`, `w` and `e` be the differences of position, velocity and `force_bar` between a
+    spring's ends. The force on its first end is `t d`, so the cotangent of `t` is `-e.d`, and
+    the cotangents of `d` and `w` are
+
+        -t e + a w + b d  and  a d,  with  a = -(e.d) dt/d(d.w),  b = -2 (e.d) dt/d(d.d):
+
+    the cotangents of particles are pulls with the weights t, a and b. JAX's own transpose turns
+    every shifted slice into a padded copy, and is many times slower.
+
+    Args:
+        springs: of the body.
+        tensions: of its springs.
+        position: with halo, metres.
+        velocity: with halo, metres per second.
+        force_bar: cotangent of the forces, with halo.
+    """
+    by_rate, by_square = [], []
+    stiffness_bar, damping_bar, rest_length_bar = [], [], []
+    shortest_bar = jnp.zeros_like(springs.shortest)
+    for row, tension in enumerate(tensions):
+        along, speed = _difference(springs, row, position), _difference(springs, row, velocity)
+        stiffness, damping = springs.stiffness[row], springs.damping[row]
+        tension_bar = -_dot(along, _difference(springs, row, force_bar))
+        square, least, rate = _dot(along, along), springs.shortest**2, _dot(along, speed)
+        squared = jnp.maximum(square, least)
+        free_bar = jnp.where(square > least, tension_bar, 0.0)
+        curvature = (stiffness - tension) * squared - damping * rate
+        by_rate.append(tension_bar * damping / squared)
+        by_square.append(free_bar * curvature / (squared * squared))
+        inverse = 1.0 / jnp.sqrt(squared)
+        stiffness_bar.append(tension_bar * (1.0 - springs.rest_length[row] * inverse))
+        damping_bar.append(tension_bar * rate / squared)
+        rest_length_bar.append(-tension_bar * stiffness * inverse)
+        slope = (tension_bar - free_bar) * curvature / (squared * squared)
+        shortest_bar += springs.shortest * slope.sum()
+    springs_bar = dataclasses.replace(
+        springs,
+        stiffness=jnp.stack(stiffness_bar),
+        damping=jnp.stack(damping_bar),
+        rest_length=jnp.stack(rest_length_bar),
+        shortest=shortest_bar,
+    )
+    position_bar = [
+        _pull(springs, tensions, force_bar[axis])
+        - _pull(springs, by_rate, velocity[axis])
+        - _pull(springs, by_square, position[axis])
+        for axis in range(3)
+    ]
+    velocity_bar = [-_pull(springs, by_rate, position[axis]) for axis in range(3)]
+    return springs_bar, position_bar, velocity_bar
+
+
+def _difference(
+    springs: Springs, row: int, values: Float[Array, "3 NHH"]
+) -> list[Float[Array, " HN"]]:
+    """Along each axis: `value_other - value_self` of the springs of one offset."""
     offset = springs.offsets[row]
-    end = position.shape[1] - springs.halo
+    end = values.shape[1] - springs.halo
     # Component by component: XLA does not vectorise a sum over the first axis.
-    along = [position[axis, offset : end + offset] - position[axis, :end] for axis in range(3)]
-    speed = [velocity[axis, offset : end + offset] - velocity[axis, :end] for axis in range(3)]
-    squared = along[0] * along[0] + along[1] * along[1] + along[2] * along[2]
-    squared = jnp.maximum(squared, springs.shortest**2)
-    rate = along[0] * speed[0] + along[1] * speed[1] + along[2] * speed[2]
-    stretch = squared - springs.rest_length[row] * jnp.sqrt(squared)
-    # The division comes last because XLA holds it too dear to repeat: it keeps the tension in
-    # memory, where it would otherwise compute it again for each of its six uses.
-    return (springs.stiffness[row] * stretch + springs.damping[row] * rate) / squared
+    return [values[axis, offset : end + offset] - values[axis, :end] for axis in range(3)]
+
+
+def _dot(a: list[Float[Array, " HN"]], b: list[Float[Array, " HN"]]) -> Float[Array, " HN"]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,0 +1,161 @@
+"""Many time steps, and their adjoint: gradients in memory of the square root of their number.
+
+Reverse mode keeps the states that `sqrt(S)` segments of the S steps start from. Backwards,
+it takes the steps of one segment again, keeping its states, and then their adjoints.
+"""
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import PyTreeDef
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsimp.dynamics.simulation import Simulation
+from jaxsimp.dynamics.step import Axes, Motion, Packed, step, step_vjp
+
+
+def plain_steps(
+    simulation: Simulation, packed: Packed, motion: Motion, shares: Float[Array, " S"]
+) -> Packed:
+    """Time steps in which held particles move by shares of their drive."""
+
+    def one(packed: Packed, share: Float[Array, ""]) -> tuple[Packed, None]:
+        return step(simulation, packed, motion, share), None
+
+    return jax.lax.scan(one, packed, shares)[0]
+
+
+def steps(
+    simulation: Simulation, packed: Packed, motion: Motion, shares: Float[Array, " S"]
+) -> Packed:
+    """`plain_steps`, differentiated in reverse mode by the adjoint; shares count as constants."""
+    leaves, tree = jax.tree.flatten(simulation)
+    return _steps(tree, leaves, packed, motion.held, motion.drive, shares)
+
+
+# Of leaves, not of a `Simulation`: JAX makes trees of things that are no arrays here.
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _steps(
+    tree: PyTreeDef,
+    leaves: list[Any],
+    packed: Packed,
+    held: Bool[Array, " N"],
+    drive: Float[Array, "3 N"],
+    shares: Float[Array, " S"],
+) -> Packed:
+    return plain_steps(_simulation(tree, leaves), packed, Motion(held, drive), shares)
+
+
+Starts = tuple[Float[Array, "segments 3 NHH"], Float[Array, "segments 3 NHH"]]
+
+Kept = tuple[list[Any], Any, Any, Any, list[Any] | None]
+"""Arguments, states at the start of segments, and zero cotangents of the simulation, if wanted."""
+
+
+def _forward(tree: PyTreeDef, *arguments: Any) -> tuple[Packed, Kept]:
+    """The steps, and what their adjoint needs."""
+    wanted = any(leaf.perturbed for leaf in arguments[0])
+    leaves, packed, held, drive, shares = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf.value),
+        arguments,
+        is_leaf=lambda leaf: hasattr(leaf, "perturbed"),
+    )
+    simulation, motion = _simulation(tree, leaves), Motion(held, drive)
+
+    def segment(packed: Packed, bounds: Int[Array, " 2"]) -> tuple[Packed, Packed]:
+        def one(i: Int[Array, ""], packed: Packed) -> Packed:
+            return step(simulation, packed, motion, shares[i])
+
+        return jax.lax.fori_loop(bounds[0], bounds[1], one, packed), packed
+
+    packed, starts = jax.lax.scan(segment, packed, _segments(len(shares)))
+    zeros = jax.tree.map(jnp.zeros_like, leaves) if wanted else None
+    return packed, (leaves, motion, shares, starts, zeros)
+
+
+Bars = tuple[Simulation | None, tuple[Axes, Axes], Float[Array, "3 N"]]
+"""Cotangents of the simulation, if wanted, of the state without halo, and of the drive."""
+
+
+def _backward(
+    tree: PyTreeDef, kept: Kept, packed_bar: Any
+) -> tuple[list[Array] | None, Packed, None, Float[Array, "3 N"], None]:
+    """Segment by segment from the last: its steps again, then their adjoints backwards."""
+    leaves, motion, shares, starts, zeros = kept
+    simulation = _simulation(tree, leaves)
+    simulation_bar = None if zeros is None else _simulation(tree, zeros)
+    segments = _segments(len(shares))
+    length = int(np.diff(segments).max(initial=0))
+    padded = jnp.pad(shares, (0, length))
+    halo, count = simulation.springs.halo, len(simulation.mass)
+
+    def segment(bars: Bars, saved: tuple[Int[Array, " 2"], Packed]) -> tuple[Bars, None]:
+        (first, end), packed = saved
+
+        def record(packed: Packed, share: Float[Array, ""]) -> tuple[Packed, Packed]:
+            return step(simulation, packed, motion, share), packed
+
+        again = jax.lax.dynamic_slice_in_dim(padded, first, length)
+        _, states = jax.lax.scan(record, packed, again)
+
+        def state_at(i: Int[Array, ""]) -> Packed:
+            return jax.tree.map(lambda array: array[jnp.maximum(i - first, 0)], states)
+
+        def back(k: Int[Array, ""], carry: tuple[Bars, Packed]) -> tuple[Bars, Packed]:
+            (simulation_bar, packed_bar, drive_bar), packed = carry
+            i = end - 1 - k
+            more, packed_bar, drive_more = step_vjp(
+                simulation, packed, motion, shares[i], packed_bar
+            )
+            if simulation_bar is not None:
+                simulation_bar = jax.tree.map(jnp.add, simulation_bar, more)
+            # The state of the next turn is carried: XLA would look it up in `states` anew for
+            # each of its uses, element by element.
+            return (simulation_bar, packed_bar, drive_bar + drive_more), state_at(i - 1)
+
+        return jax.lax.fori_loop(0, end - first, back, (bars, state_at(end - 1)))[0], None
+
+    bars = (
+        simulation_bar,
+        tuple(
+            [bar[axis, halo : halo + count] for axis in range(3)]
+            for bar in jax.tree.map(_dense, packed_bar, is_leaf=_is_zero)
+        ),
+        jnp.zeros_like(motion.drive),
+    )
+    bars, _ = jax.lax.scan(segment, bars, (segments, starts), reverse=True)
+    simulation_bar, (position_bar, velocity_bar), drive_bar = bars
+    padding = ((0, 0), (halo, halo))
+    packed_bar = (
+        jnp.pad(jnp.stack(position_bar), padding),
+        jnp.pad(jnp.stack(velocity_bar), padding),
+    )
+    leaves_bar = None if simulation_bar is None else jax.tree.leaves(simulation_bar)
+    return leaves_bar, packed_bar, None, drive_bar, None
+
+
+_steps.defvjp(_forward, _backward, symbolic_zeros=True)
+
+
+def _simulation(tree: PyTreeDef, leaves: list[Any]) -> Simulation:
+    # JAX hands on constants as NumPy arrays.
+    return jax.tree.unflatten(tree, [jnp.asarray(leaf) for leaf in leaves])
+
+
+def _segments(count: int) -> Int[np.ndarray, "segments 2"]:
+    """First and end of about `sqrt(count)` runs of as many steps each."""
+    length = math.isqrt(max(count - 1, 0)) + 1
+    first = np.arange(0, count, length)
+    return np.stack([first, np.minimum(first + length, count)], axis=1)
+
+
+def _is_zero(tree: Any) -> bool:
+    return isinstance(tree, jax.custom_derivatives.SymbolicZero)
+
+
+def _dense(bar: Any) -> Array:
+    return jnp.zeros(bar.shape, bar.dtype) if _is_zero(bar) else bar
