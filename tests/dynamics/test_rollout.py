@@ -28,7 +28,7 @@ from jaxsimp.dynamics import (
 
 G = 9.81
 # jitted once, so that tests on bodies with the same springs share what was compiled
-jit_settle = jax.jit(settle, static_argnames="steps")
+jit_settle = jax.jit(settle, static_argnames="num_steps")
 
 
 def irregular(seed: int = 0, num_particles: int = 9, num_springs: int = 16) -> Body:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jaxsimp.body import Body, cloth, rope
 from jaxsimp.dynamics import State, largest_time_step, make_simulation, settle
 
-jit_settle = jax.jit(settle, static_argnames="steps")
+jit_settle = jax.jit(settle, static_argnames="num_steps")
 
 
 def line_matrices(body: Body) -> tuple[np.ndarray, np.ndarray]:
