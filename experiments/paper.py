@@ -49,7 +49,12 @@ class Budget:
 
 
 _PAPER = CEMConfig(
-    num_iterations=20, smoothing=0.0, initial_spread=0.5**0.5, keep_best=False, returns="mean"
+    num_iterations=20,
+    initial_populations=1,
+    smoothing=0.0,
+    initial_spread=0.5**0.5,
+    keep_best=False,
+    returns="mean",
 )
 BUDGETS = {
     "default": Budget(rope=CEMConfig(num_iterations=24), cloth=CEMConfig(num_iterations=24)),
@@ -60,8 +65,8 @@ BUDGETS = {
         limit=0.08,
     ),
     "smoke": Budget(
-        rope=CEMConfig(num_iterations=3, population=16),
-        cloth=CEMConfig(num_iterations=3, population=16),
+        rope=CEMConfig(num_iterations=3, population=16, initial_populations=1),
+        cloth=CEMConfig(num_iterations=3, population=16, initial_populations=1),
     ),
 }
 
@@ -181,7 +186,7 @@ def _run_all(
     )
     with Progress(*columns, console=console) as progress:
         for name, planner in planners.items():
-            bar = progress.add_task(name, total=len(left[name]) * planner.config.num_iterations)
+            bar = progress.add_task(name, total=len(left[name]) * planner.config.num_populations)
             compile_seconds = planner.compile_seconds
             for run in left[name]:
                 advance = partial(progress.advance, bar)
@@ -197,7 +202,7 @@ def _run(
     run: tuple[str, str, int],
     folder: Path,
     environment: dict[str, Any],
-    on_iteration: Callable[[], None],
+    on_population: Callable[[], None],
 ) -> dict[str, Any]:
     """Plan once, execute, save the plan, and return the row."""
     action_space, encoding, seed = run
@@ -205,7 +210,7 @@ def _run(
     everything = np.arange(task.body.num_particles)
     candidates = everything[model.mask] if action_space == "key_points" else everything
     episode = task.episode_fn(seed)
-    plan = planner.plan(episode, candidates, ENCODINGS[encoding], seed, on_iteration)
+    plan = planner.plan(episode, candidates, ENCODINGS[encoding], seed, on_population)
     execution = planner.execute(episode, plan.actions)
     file = f"{PLANS_FOLDER}/{task.name}-{action_space}-{encoding}-{seed}.npz"
     save_plan(folder / file, plan.actions, execution.positions)

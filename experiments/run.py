@@ -44,6 +44,8 @@ class Options:
     """CEM rounds, instead of the budget's."""
     population: int | None = None
     """Plans drawn a round, instead of the budget's."""
+    initial_populations: int | None = None
+    """Populations drawn in the first CEM round, instead of the budget's."""
     elite_fraction: float | None = None
     """Share of the population that are elites, instead of the budget's."""
     smoothing: float | None = None

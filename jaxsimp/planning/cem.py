@@ -25,6 +25,8 @@ class CEMConfig:
     Attributes:
         num_iterations: rounds of sampling and fitting.
         population: plans drawn in each round.
+        initial_populations: as many times `population` plans are drawn in the first round: what
+            the first elites miss, later rounds seldom find again.
         elite_fraction: share of the population that the distribution is fitted to.
         smoothing: share of the old distribution that is kept in each update.
         initial_spread: deviation of the first displacements, in units of the limits.
@@ -37,6 +39,7 @@ class CEMConfig:
 
     num_iterations: int = 15
     population: int = 128
+    initial_populations: int = 4
     elite_fraction: float = 0.1
     smoothing: float = 0.1
     initial_spread: float = 0.7
@@ -44,7 +47,7 @@ class CEMConfig:
     returns: Literal["best", "mean"] = "best"
 
     def __post_init__(self) -> None:
-        for name in ("num_iterations", "population"):
+        for name in ("num_iterations", "population", "initial_populations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
         if not 0 < self.elite_fraction <= 1:
@@ -55,6 +58,11 @@ class CEMConfig:
             raise ValueError(f"initial_spread is {self.initial_spread}; give a number above 0")
         if self.returns not in ("best", "mean"):
             raise ValueError(f'returns is {self.returns}; give "best" or "mean"')
+
+    @property
+    def num_populations(self) -> int:
+        """Populations drawn in all rounds."""
+        return self.num_iterations + self.initial_populations - 1
 
     @property
     def num_elites(self) -> int:
@@ -93,7 +101,7 @@ def search(
     config: CEMConfig,
     key: PRNGKeyArray,
     evaluate_fn: EvaluateFn,
-    on_iteration: Callable[[], None] = lambda: None,
+    on_population: Callable[[], None] = lambda: None,
 ) -> Search:
     """Search for a plan of low cost.
 
@@ -105,18 +113,21 @@ def search(
         config: settings.
         key: of the random draws.
         evaluate_fn: costs of `population` plans at a time, or of one.
-        on_iteration: called after each iteration.
+        on_population: called after each population.
     """
     distribution = encoding.init(space, config.initial_spread)
     best: _Pool | None = None
     best_costs, elite_costs, non_finite = [], [], 0
+    keys = iter(jax.random.split(key, config.num_populations))
     for iteration in range(config.num_iterations):
-        samples, actions = _ask(
-            encoding, config.population, space, distribution, jax.random.fold_in(key, iteration)
-        )
-        costs, failed = _rank_last(evaluate_fn(actions))
-        non_finite += failed
-        pool = _Pool(samples, actions, costs)
+        pools = []
+        for _ in range(1 if iteration else config.initial_populations):
+            samples, actions = _ask(encoding, config.population, space, distribution, next(keys))
+            costs, failed = _rank_last(evaluate_fn(actions))
+            non_finite += failed
+            pools.append(_Pool(samples, actions, costs))
+            on_population()
+        pool = pools[0].joined_by(*pools[1:])
         if config.keep_best and best is not None:
             pool = best.joined_by(pool)
         elites = pool.take(np.argsort(pool.costs, kind="stable")[: config.num_elites])
@@ -125,9 +136,8 @@ def search(
         distribution = _tell(encoding, space, distribution, elites.samples, config.smoothing)
         best_costs.append(float(best.costs[0]))
         elite_costs.append(float(elites.costs.mean()))
-        on_iteration()
     assert best is not None  # there is at least one iteration
-    num_rollouts = config.num_iterations * config.population
+    num_rollouts = config.num_populations * config.population
     if config.returns == "mean":
         actions = encoding.decode(space, encoding.mean(space, distribution))
         actions = jax.tree.map(lambda array: array[None], actions)
@@ -156,8 +166,8 @@ class _Pool:
     def take(self, index: np.ndarray | slice) -> "_Pool":
         return self._map(lambda array: np.asarray(array)[index])
 
-    def joined_by(self, other: "_Pool") -> "_Pool":
-        return self._map(lambda *arrays: np.concatenate(arrays), other)
+    def joined_by(self, *others: "_Pool") -> "_Pool":
+        return self._map(lambda *arrays: np.concatenate(arrays), *others)
 
     def _map(self, fn: Callable[..., np.ndarray], *others: "_Pool") -> "_Pool":
         pools = (self, *others)

@@ -95,7 +95,7 @@ class Planner:
         candidates: Int[np.ndarray, " K"],
         encoding: Encoding,
         seed: int,
-        on_iteration: Callable[[], None] = lambda: None,
+        on_population: Callable[[], None] = lambda: None,
     ) -> Plan:
         """Search for a plan.
 
@@ -104,7 +104,7 @@ class Planner:
             candidates: ids of the particles that may be grasped, shape (K,).
             encoding: of plans as samples of a distribution.
             seed: of the random draws.
-            on_iteration: called after each iteration.
+            on_population: called after each population.
         """
         space = ActionSpace(
             jnp.asarray(candidates),
@@ -115,11 +115,11 @@ class Planner:
         shared = (self._physics, self._episode(episode))
         key = jax.random.key(seed)
         start = time.perf_counter()
-        once = dataclasses.replace(self.config, num_iterations=1)
+        once = dataclasses.replace(self.config, num_iterations=1, initial_populations=1)
         search(space, encoding, once, key, lambda actions: np.zeros(len(actions.pick)))
         compiled = time.perf_counter()
         costs = partial(self._costs, shared)
-        found = search(space, encoding, self.config, key, costs, on_iteration)
+        found = search(space, encoding, self.config, key, costs, on_population)
         return Plan(
             actions=found.actions,
             search=found,
@@ -132,7 +132,7 @@ class Planner:
         shared = (self._physics, self._episode(self.task.episode_fn(0)))
         start = time.perf_counter()
         self._costs(shared, self._idle())
-        return (time.perf_counter() - start) * self.config.num_iterations
+        return (time.perf_counter() - start) * self.config.num_populations
 
     def execute(self, episode: Episode, actions: Actions) -> Execution:
         """Carry out a plan, let the body settle, and score it."""

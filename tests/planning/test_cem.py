@@ -29,9 +29,14 @@ def sphere(actions: Actions) -> np.ndarray:
     return (off**2).sum(axis=(1, 2, 3)) + wrong.sum(axis=(1, 2))
 
 
-def found_by(cost_fn, encoding=categorical, key=0, on_iteration=lambda: None, **settings) -> Search:
-    config = CEMConfig(**{"num_iterations": 6, "population": 24} | settings)
-    return search(space(), encoding, config, jax.random.key(key), cost_fn, on_iteration)
+DEFAULTS = {"num_iterations": 6, "population": 24, "initial_populations": 1}
+
+
+def found_by(
+    cost_fn, encoding=categorical, key=0, on_population=lambda: None, **settings
+) -> Search:
+    config = CEMConfig(**DEFAULTS | settings)
+    return search(space(), encoding, config, jax.random.key(key), cost_fn, on_population)
 
 
 def recorded(cost_fn, batches):
@@ -145,10 +150,24 @@ def test_best_costs_never_rise(encoding):
     assert np.all(np.diff(found.best_costs) <= 0)
 
 
-def test_every_iteration_is_reported():
+def test_every_population_is_reported():
     ticks = []
-    found_by(sphere, on_iteration=lambda: ticks.append(None))
-    assert len(ticks) == 6
+    found_by(sphere, on_population=lambda: ticks.append(None), initial_populations=3)
+    assert len(ticks) == 8
+
+
+@encodings
+def test_the_first_round_draws_more_populations_from_one_distribution(encoding):
+    batches = []
+    found = found_by(recorded(sphere, batches), encoding, initial_populations=3, num_iterations=2)
+    costs = np.concatenate([costs for _, _, costs in batches])
+    assert len(batches) == 4
+    assert found.num_rollouts == len(costs) == 96
+    assert not np.array_equal(batches[0][1], batches[1][1])
+    # The elites of the first round are those of all 72 plans; 2 are a tenth of 24.
+    first = np.sort(costs[:72])[:2]
+    assert found.elite_costs[0] == pytest.approx(first.mean(), rel=1e-6)
+    assert found.best_costs == (costs[:72].min(), costs.min())
 
 
 @encodings
@@ -219,6 +238,7 @@ def test_a_search_recovers_from_a_first_round_without_a_finite_rollout():
     ("name", "value"),
     [
         ("num_iterations", 0),
+        ("initial_populations", 0),
         ("population", -5),
         ("elite_fraction", 0.0),
         ("elite_fraction", 1.5),

@@ -15,7 +15,7 @@ from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Plan, Planner, load_p
 from jaxsimp.planning import plan as plan_module
 from jaxsimp.tasks import make_task, score
 
-CONFIG = CEMConfig(num_iterations=2, population=6)
+CONFIG = CEMConfig(num_iterations=2, population=6, initial_populations=1)
 CANDIDATES = np.array([0, 4, 8])
 LAYOUT = Layout(chunk_size=1, num_workers=2)
 
@@ -89,7 +89,8 @@ task = dataclasses.replace(
     make_task("rope_folding", 9),
     num_actions=2, action_seconds=0.05, settle_actions=2,
 )
-planner = Planner(task, CEMConfig(num_iterations=2, population=6), Layout(1, 2))
+config = CEMConfig(num_iterations=2, population=6, initial_populations=1)
+planner = Planner(task, config, Layout(1, 2))
 episode = task.episode_fn(3)
 plan = planner.plan(episode, np.array([0, 4, 8]), ENCODINGS["categorical"], 3)
 np.savez(
@@ -207,7 +208,9 @@ def test_float64_plans(x64):
         action_seconds=0.02,
         settle_actions=1,
     )
-    made = Planner(task, CEMConfig(num_iterations=1, population=2), Layout(1, 1))
+    made = Planner(
+        task, CEMConfig(num_iterations=1, population=2, initial_populations=1), Layout(1, 1)
+    )
     plan = made.plan(task.episode_fn(0), np.array([0]), ENCODINGS["categorical"], 0)
     assert plan.actions.displacement.dtype == np.float64
     assert made.execute(task.episode_fn(0), plan.actions).positions.dtype == np.float64
