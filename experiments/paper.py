@@ -57,7 +57,7 @@ _PAPER = CEMConfig(
     returns="mean",
 )
 BUDGETS = {
-    "default": Budget(rope=CEMConfig(num_iterations=24), cloth=CEMConfig(num_iterations=24)),
+    "default": Budget(rope=CEMConfig(num_iterations=20), cloth=CEMConfig(num_iterations=20)),
     "paper": Budget(
         rope=dataclasses.replace(_PAPER, population=70),
         cloth=dataclasses.replace(_PAPER, population=333),
