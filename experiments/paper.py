@@ -22,7 +22,6 @@ from jaxsimp.planning import (
     ENCODINGS,
     CEMConfig,
     Planner,
-    default_layout,
     save_plan,
 )
 from jaxsimp.simplify import KeyPoints, simplify
@@ -57,7 +56,7 @@ _PAPER = CEMConfig(
     returns="mean",
 )
 BUDGETS = {
-    "default": Budget(rope=CEMConfig(num_iterations=20), cloth=CEMConfig(num_iterations=20)),
+    "default": Budget(rope=CEMConfig(num_iterations=24), cloth=CEMConfig(num_iterations=24)),
     "paper": Budget(
         rope=dataclasses.replace(_PAPER, population=70),
         cloth=dataclasses.replace(_PAPER, population=333),
@@ -206,7 +205,7 @@ def _run(
 ) -> dict[str, Any]:
     """Plan once, execute, save the plan, and return the row."""
     action_space, encoding, seed = run
-    task, config = planner.task, planner.config
+    task = planner.task
     everything = np.arange(task.body.num_particles)
     candidates = everything[model.mask] if action_space == "key_points" else everything
     episode = task.episode_fn(seed)
@@ -233,22 +232,22 @@ def _run(
         "plan_seconds": plan.seconds,
         "compile_seconds": plan.compile_seconds,
         "plan": file,
-        "config": _row_config(task, config),
+        "config": _row_config(planner),
         "environment": environment,
     }
 
 
-def _row_config(task: Task, config: CEMConfig) -> dict[str, Any]:
-    layout = default_layout(config.population)
+def _row_config(planner: Planner) -> dict[str, Any]:
+    task = planner.task
     return {
-        **dataclasses.asdict(config),
+        **dataclasses.asdict(planner.config),
         "num_actions": task.num_actions,
         "num_pickers": task.num_pickers,
         "limits": list(task.limits),
         "time_step": task.time_step,
         "action_steps": task.action_steps,
         "settle_actions": task.settle_actions,
-        "layout": dataclasses.asdict(layout),
+        "layout": dataclasses.asdict(planner.layout),
     }
 
 

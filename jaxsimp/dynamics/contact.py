@@ -6,11 +6,11 @@ from jaxtyping import Array, Float
 
 
 def table_contact(
-    height: Float[Array, " N"],
-    velocity: list[Float[Array, " N"]],
+    height: Float[Array, "N *B"],
+    velocity: list[Float[Array, "N *B"]],
     friction: Float[Array, ""],
     time_step: Float[Array, ""],
-) -> list[Float[Array, " N"]]:
+) -> list[Float[Array, "N *B"]]:
     """Velocities after contact: no particle sinks into the table, and Coulomb friction acts.
 
     The normal impulse is the one that leaves a particle on the table at the end of the step

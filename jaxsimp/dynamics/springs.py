@@ -1,12 +1,16 @@
-"""Spring forces, stored by the offset between the particle ids of a spring's ends.
+"""Spring forces: sums over the springs of each particle, without scatter.
 
-In a rope or a row-major grid the springs have few distinct offsets `j - i` (2 and 6), so
-the springs of one offset are a shifted copy of the particles: forces become sums of shifted
-arrays, without gather or scatter. This is diagonal (DIA) storage of the spring matrix. It is
-right for any body, and fast for those with few offsets.
+Springs are stored in rows, a row with at most one spring from each particle:
 
-Inside a simulation positions and velocities are (3, N + 2 H): x, y, z as rows, with a halo of
-`H` inert particles, the largest offset, at either end, so that every shift stays in bounds.
+- By offset, where ids of neighbours differ by few distinct offsets `j - i` (2 in a rope, 6 in a
+  row-major grid): the springs of one offset are a shifted copy of the particles, and forces
+  become sums of shifted arrays. This is diagonal (DIA) storage of the spring matrix.
+- By neighbour, for any other body: row `s` holds the `s`-th spring of each particle, so that
+  each spring is there twice, once from either end. This is ELLPACK storage.
+
+Inside a simulation positions and velocities are (3, N + 2 H, *B): x, y, z as rows, with a halo
+of `H` inert particles, the largest offset or 0, at either end, so that every shift stays in
+bounds. `*B` are axes of a batch: last, so that the same particle of all samples is contiguous.
 """
 
 import dataclasses
@@ -16,25 +20,29 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsimp.body import Body
+
+MOST_OFFSETS = 16
+"""Bodies with more distinct offsets are stored by neighbour."""
 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["stiffness", "damping", "rest_length", "shortest"],
+    data_fields=["neighbours", "stiffness", "damping", "rest_length", "shortest"],
     meta_fields=["offsets"],
 )
 @dataclass(frozen=True)
 class Springs:
-    """The springs of a body, by offset.
+    """The springs of a body, by offset or by neighbour.
 
-    Row `d`, column `H + i` is the spring from particle `i` to `i + offsets[d]`; stiffness and
-    damping are zero where the body has none.
+    Row `d`, column `H + i` is the spring from particle `i` to `i + offsets[d]`, or, where there
+    are no offsets, to `neighbours[d, i]`. Stiffness and damping are zero where there is none.
 
     Attributes:
-        offsets: distinct values of `j - i`, ascending, static.
+        offsets: distinct values of `j - i`, ascending, static; empty for storage by neighbour.
+        neighbours: particle ids, shape (D, N); `D` is 0 for storage by offset.
         stiffness: shape (D, H + N), newtons per metre.
         damping: shape (D, H + N), newton-seconds per metre.
         rest_length: shape (D, H + N), metres.
@@ -42,6 +50,7 @@ class Springs:
     """
 
     offsets: tuple[int, ...]
+    neighbours: Int[Array, "... E N"]
     stiffness: Float[Array, "... D HN"]
     damping: Float[Array, "... D HN"]
     rest_length: Float[Array, "... D HN"]
@@ -54,29 +63,41 @@ class Springs:
 
 
 def make_springs(body: Body) -> Springs:
-    """The springs of a body, sorted by offset."""
+    """The springs of a body, by offset if they have at most `MOST_OFFSETS`, or by neighbour."""
     low, high = body.springs.min(axis=1), body.springs.max(axis=1)
-    offsets, row = np.unique(high - low, return_inverse=True)
-    halo = int(offsets.max(initial=0))
+    distinct, row = np.unique(high - low, return_inverse=True)
+    if len(distinct) <= MOST_OFFSETS:
+        offsets = tuple(int(offset) for offset in distinct)
+        halo, spring, column = max(offsets, default=0), np.arange(len(low)), low
+        neighbours = np.zeros((0, body.num_particles), dtype=int)
+    else:
+        offsets, halo = (), 0
+        column, other = np.concatenate([low, high]), np.concatenate([high, low])
+        order = np.argsort(column, kind="stable")
+        column, other, spring = column[order], other[order], np.tile(np.arange(len(low)), 2)[order]
+        row = np.arange(len(column)) - np.searchsorted(column, column)
+        neighbours = np.tile(np.arange(body.num_particles), (row.max() + 1, 1))
+        neighbours[row, column] = other
 
-    def by_offset(values: np.ndarray) -> Array:
-        table = np.zeros((len(offsets), halo + body.num_particles))
-        table[row, halo + low] = values
+    def in_rows(values: np.ndarray) -> Array:
+        table = np.zeros((max(len(offsets), len(neighbours)), halo + body.num_particles))
+        table[row, halo + column] = values[spring]
         return jnp.asarray(table, dtype=float)
 
     return Springs(
-        offsets=tuple(int(offset) for offset in offsets),
-        stiffness=by_offset(body.stiffness),
-        damping=by_offset(body.damping),
-        rest_length=by_offset(body.rest_length),
+        offsets=offsets,
+        neighbours=jnp.asarray(neighbours, dtype=int),
+        stiffness=in_rows(body.stiffness),
+        damping=in_rows(body.damping),
+        rest_length=in_rows(body.rest_length),
         # A thousandth of a spring: far below any state of interest, far above rounding.
         shortest=jnp.asarray(1e-3 * body.rest_length.min(initial=1.0), dtype=float),
     )
 
 
 def spring_tensions(
-    springs: Springs, position: Float[Array, "3 NHH"], velocity: Float[Array, "3 NHH"]
-) -> list[Float[Array, " HN"]]:
+    springs: Springs, position: Float[Array, "3 NHH *B"], velocity: Float[Array, "3 NHH *B"]
+) -> list[Float[Array, "HN *B"]]:
     """Force of each spring over the distance of its ends, newtons per metre, by offset.
 
     Hooke's law with damping along the spring: the force on `i` towards `j` is
@@ -90,11 +111,12 @@ def spring_tensions(
         velocity: with halo, metres per second.
     """
     tensions = []
-    for row in range(len(springs.offsets)):
+    for row in range(len(springs.stiffness)):
         along, speed = _difference(springs, row, position), _difference(springs, row, velocity)
+        stiffness, damping, rest_length = _row(springs, row, along[0])
         squared = jnp.maximum(_dot(along, along), springs.shortest**2)
-        stretch = squared - springs.rest_length[row] * jnp.sqrt(squared)
-        force = springs.stiffness[row] * stretch + springs.damping[row] * _dot(along, speed)
+        stretch = squared - rest_length * jnp.sqrt(squared)
+        force = stiffness * stretch + damping * _dot(along, speed)
         # The division comes last because XLA holds it too dear to repeat: it keeps the tension
         # in memory, where it would otherwise compute it again for each of its six uses.
         tensions.append(force / squared)
@@ -102,8 +124,8 @@ def spring_tensions(
 
 
 def pull(
-    springs: Springs, weights: list[Float[Array, " HN"]], values: Float[Array, "3 NHH"]
-) -> list[Float[Array, " N"]]:
+    springs: Springs, weights: list[Float[Array, "HN *B"]], values: Float[Array, "3 NHH *B"]
+) -> list[Float[Array, "N *B"]]:
     """Along each axis: the sum over a particle's springs of `weight (value_other - value_self)`.
 
     The forces of the springs, newtons, when the weights are tensions and the values positions.
@@ -117,12 +139,16 @@ def pull(
 
 
 def _pull(
-    springs: Springs, weights: list[Float[Array, " HN"]], values: Float[Array, " NHH"]
-) -> Float[Array, " N"]:
+    springs: Springs, weights: list[Float[Array, "HN *B"]], values: Float[Array, "NHH *B"]
+) -> Float[Array, "N *B"]:
     halo = springs.halo
     end = len(values) - halo
     here = slice(halo, end)
     total = jnp.zeros_like(values[here])
+    if not springs.offsets:
+        for row, weight in enumerate(weights):
+            total = total + weight * (_neighbours(springs, row, values) - values)
+        return total
     for offset, weight in zip(springs.offsets, weights, strict=True):
         after, before = slice(halo + offset, end + offset), slice(halo - offset, end - offset)
         total = (
@@ -135,11 +161,11 @@ def _pull(
 
 def spring_forces_vjp(
     springs: Springs,
-    tensions: list[Float[Array, " HN"]],
-    position: Float[Array, "3 NHH"],
-    velocity: Float[Array, "3 NHH"],
-    force_bar: Float[Array, "3 NHH"],
-) -> tuple[Springs, list[Float[Array, " N"]], list[Float[Array, " N"]]]:
+    tensions: list[Float[Array, "HN *B"]],
+    position: Float[Array, "3 NHH *B"],
+    velocity: Float[Array, "3 NHH *B"],
+    force_bar: Float[Array, "3 NHH *B"],
+) -> tuple[Springs, list[Float[Array, "N *B"]], list[Float[Array, "N *B"]]]:
     """Cotangents of springs, positions and velocities for one of the spring forces.
 
     Let `d`, `w` and `e` be the differences of position, velocity and `force_bar` between a
@@ -163,20 +189,21 @@ def spring_forces_vjp(
     shortest_bar = jnp.zeros_like(springs.shortest)
     for row, tension in enumerate(tensions):
         along, speed = _difference(springs, row, position), _difference(springs, row, velocity)
-        stiffness, damping = springs.stiffness[row], springs.damping[row]
+        stiffness, damping, rest_length = _row(springs, row, along[0])
         tension_bar = -_dot(along, _difference(springs, row, force_bar))
+        # A spring that is stored twice acts on one end each time.
+        own_bar = tension_bar if springs.offsets else _dot(along, list(force_bar))
         square, least, rate = _dot(along, along), springs.shortest**2, _dot(along, speed)
-        squared = jnp.maximum(square, least)
-        free_bar = jnp.where(square > least, tension_bar, 0.0)
+        squared, regular = jnp.maximum(square, least), square > least
         curvature = (stiffness - tension) * squared - damping * rate
         by_rate.append(tension_bar * damping / squared)
-        by_square.append(free_bar * curvature / (squared * squared))
-        inverse = 1.0 / jnp.sqrt(squared)
-        stiffness_bar.append(tension_bar * (1.0 - springs.rest_length[row] * inverse))
-        damping_bar.append(tension_bar * rate / squared)
-        rest_length_bar.append(-tension_bar * stiffness * inverse)
-        slope = (tension_bar - free_bar) * curvature / (squared * squared)
+        by_square.append(jnp.where(regular, tension_bar, 0.0) * curvature / (squared * squared))
+        slope = jnp.where(regular, 0.0, own_bar) * curvature / (squared * squared)
         shortest_bar += springs.shortest * slope.sum()
+        inverse = 1.0 / jnp.sqrt(squared)
+        stiffness_bar.append(own_bar * (1.0 - rest_length * inverse))
+        damping_bar.append(own_bar * rate / squared)
+        rest_length_bar.append(-own_bar * stiffness * inverse)
     springs_bar = dataclasses.replace(
         springs,
         stiffness=jnp.stack(stiffness_bar),
@@ -195,14 +222,31 @@ def spring_forces_vjp(
 
 
 def _difference(
-    springs: Springs, row: int, values: Float[Array, "3 NHH"]
-) -> list[Float[Array, " HN"]]:
-    """Along each axis: `value_other - value_self` of the springs of one offset."""
+    springs: Springs, row: int, values: Float[Array, "3 NHH *B"]
+) -> list[Float[Array, "HN *B"]]:
+    """Along each axis: `value_other - value_self` of the springs of one row."""
+    # Component by component: XLA does not vectorise a sum over the first axis.
+    if not springs.offsets:
+        return [_neighbours(springs, row, values[axis]) - values[axis] for axis in range(3)]
     offset = springs.offsets[row]
     end = values.shape[1] - springs.halo
-    # Component by component: XLA does not vectorise a sum over the first axis.
     return [values[axis, offset : end + offset] - values[axis, :end] for axis in range(3)]
 
 
-def _dot(a: list[Float[Array, " HN"]], b: list[Float[Array, " HN"]]) -> Float[Array, " HN"]:
+def _neighbours(springs: Springs, row: int, values: Float[Array, "N *B"]) -> Float[Array, "N *B"]:
+    return values.at[springs.neighbours[row]].get(mode="promise_in_bounds")
+
+
+def _row(springs: Springs, row: int, like: Array) -> list[Array]:
+    """Stiffness, damping and rest length of the springs of one row, to go with a batch."""
+    tables = (springs.stiffness, springs.damping, springs.rest_length)
+    return [over_batch(table[row], like) for table in tables]
+
+
+def over_batch(values: Float[Array, " N"], like: Float[Array, "N *B"]) -> Array:
+    """Values of particles with an axis of length 1 for each axis of a batch."""
+    return values.reshape(values.shape + (1,) * (like.ndim - 1))
+
+
+def _dot(a: list[Float[Array, "HN *B"]], b: list[Float[Array, "HN *B"]]) -> Float[Array, "HN *B"]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -8,6 +8,7 @@ dear to repeat.
 import dataclasses
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +16,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsimp.dynamics.contact import table_contact
 from jaxsimp.dynamics.simulation import Simulation, State
-from jaxsimp.dynamics.springs import pull, spring_forces_vjp, spring_tensions
+from jaxsimp.dynamics.springs import over_batch, pull, spring_forces_vjp, spring_tensions
 
-Axes = list[Float[Array, " N"]]
+Axes = list[Float[Array, "N *B"]]
 """Something of every particle along x, y and z."""
 
-Packed = tuple[Float[Array, "3 NHH"], Float[Array, "3 NHH"]]
-"""Positions and velocities as springs.py wants them: axis first, with halo."""
+Packed = tuple[Float[Array, "3 NHH *B"], Float[Array, "3 NHH *B"]]
+"""Positions and velocities as springs.py wants them: axis first, with halo, batch last."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["held", "drive"], meta_fields=[])
@@ -30,13 +31,13 @@ class Motion:
     """What pickers do to the particles during an action.
 
     Attributes:
-        held: which are held, shape (N,).
-        drive: their displacement over the time step, shape (3, N), metres per second; zero
+        held: which are held, shape (N, *B).
+        drive: their displacement over the time step, shape (3, N, *B), metres per second; zero
             where nothing is held.
     """
 
-    held: Bool[Array, " N"]
-    drive: Float[Array, "3 N"]
+    held: Bool[Array, "N *B"]
+    drive: Float[Array, "3 N *B"]
 
 
 def step(simulation: Simulation, packed: Packed, motion: Motion, share: Float[Array, ""]) -> Packed:
@@ -45,10 +46,12 @@ def step(simulation: Simulation, packed: Packed, motion: Motion, share: Float[Ar
     tensions = spring_tensions(simulation.springs, position, velocity)
     forces = pull(simulation.springs, tensions, position)
     moved = _velocities(simulation, motion, share, forces, *_here(simulation, packed))
-    # Velocities are written in place; then all positions move, the halo by zero. (To write
-    # positions in place, too, costs a fifth of the step: they are also what is read.)
-    halo = simulation.springs.halo
-    velocity = jax.lax.dynamic_update_slice(velocity, moved, (0, halo))
+    # Velocities are written in place, row by row: a stack of rows would not be vectorised. Then
+    # all positions move, the halo by zero. (To write positions in place, too, costs a fifth of
+    # the step: they are also what is read.)
+    for axis in range(3):
+        corner = (axis, simulation.springs.halo) + (0,) * (velocity.ndim - 2)
+        velocity = jax.lax.dynamic_update_slice(velocity, moved[axis][None], corner)
     return position + simulation.time_step * velocity, velocity
 
 
@@ -58,30 +61,34 @@ def step_vjp(
     motion: Motion,
     share: Float[Array, ""],
     packed_bar: tuple[Axes, Axes],
-) -> tuple[Simulation, tuple[Axes, Axes], Float[Array, "3 N"]]:
+) -> tuple[Simulation, tuple[Axes, Axes], Float[Array, "3 N *B"]]:
     """Cotangents of the simulation, state and drive for those of the state after a step.
 
-    Cotangents of states have no halo.
+    Without a batch. Cotangents of states have no halo.
     """
     dt, springs = simulation.time_step, simulation.springs
     tensions = spring_tensions(springs, *packed)
     forces = pull(springs, tensions, packed[0])
     position_bar, velocity_bar = packed_bar
-    moved_bar = jnp.stack([v + dt * x for x, v in zip(position_bar, velocity_bar, strict=True)])
-
+    moved_bar = [v + dt * x for x, v in zip(position_bar, velocity_bar, strict=True)]
     names = ("mass", "radius", "drag", "friction", "gravity", "time_step")
-    physics = {name: getattr(simulation, name) for name in names}
+    physics: dict[str, Any] = {name: getattr(simulation, name) for name in names}
 
     def velocities(
-        physics: dict[str, Array], drive: Float[Array, "3 N"], *state: Axes | Float[Array, " N"]
-    ) -> Float[Array, "3 N"]:
+        physics: dict[str, Any],
+        drive: Float[Array, "3 N"],
+        forces: Axes,
+        velocity: Axes,
+        height: Float[Array, " N"],
+    ) -> Axes:
         changed = dataclasses.replace(simulation, **physics)
-        return _velocities(changed, Motion(motion.held, drive), share, *state)
+        driven = Motion(motion.held, drive)
+        return _velocities(changed, driven, share, forces, velocity, height)
 
     here = _here(simulation, packed)
     moved, pullback = jax.vjp(velocities, physics, motion.drive, forces, *here)
     physics_bar, drive_bar, forces_bar, velocity_bar, height_bar = pullback(moved_bar)
-    physics_bar["time_step"] += jnp.vdot(jnp.stack(position_bar), moved)
+    physics_bar["time_step"] += sum(map(jnp.vdot, position_bar, moved))
     force_bar = packed[0]  # Any halo will do: the springs into it have no stiffness.
     for axis, row in enumerate(forces_bar):
         force_bar = jax.lax.dynamic_update_slice(force_bar, row[None], (axis, springs.halo))
@@ -102,10 +109,13 @@ def _velocities(
     share: Float[Array, ""],
     forces: Axes,
     velocity: Axes,
-    height: Float[Array, " N"],
-) -> Float[Array, "3 N"]:
+    height: Float[Array, "N *B"],
+) -> Axes:
     """Velocities after forces, contact and pickers, particle by particle."""
-    mass, dt = simulation.mass, simulation.time_step
+    dt = simulation.time_step
+    # Held particles are not free: any mass will do. (With a batch, it makes the mass an array as
+    # large as the batch; a division by anything smaller becomes a product with its inverse.)
+    mass = jnp.where(motion.held, 1.0, over_batch(simulation.mass, height))
     kept = 1.0 - dt * simulation.drag
     gravity = (0.0, 0.0, simulation.gravity)
     # As momentum over mass, for the division.
@@ -114,10 +124,10 @@ def _velocities(
         for axis in range(3)
     ]
     moved = table_contact(height - simulation.radius, free, simulation.friction, dt)
-    return jnp.where(motion.held[None], motion.drive * share, jnp.stack(moved))
+    return [jnp.where(motion.held, motion.drive[axis] * share, moved[axis]) for axis in range(3)]
 
 
-def _here(simulation: Simulation, packed: Packed) -> tuple[Axes, Float[Array, " N"]]:
+def _here(simulation: Simulation, packed: Packed) -> tuple[Axes, Float[Array, "N *B"]]:
     """Velocities and heights without halo."""
     position, velocity = packed
     here = slice(simulation.springs.halo, simulation.springs.halo + len(simulation.mass))

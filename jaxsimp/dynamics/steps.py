@@ -43,11 +43,35 @@ def _steps(
     tree: PyTreeDef,
     leaves: list[Any],
     packed: Packed,
-    held: Bool[Array, " N"],
-    drive: Float[Array, "3 N"],
+    held: Bool[Array, "N *B"],
+    drive: Float[Array, "3 N *B"],
     shares: Float[Array, " S"],
 ) -> Packed:
-    return plain_steps(_simulation(tree, leaves), packed, Motion(held, drive), shares)
+    @jax.custom_batching.custom_vmap
+    def run(
+        leaves: list[Any], packed: Any, held: Any, drive: Any, shares: Float[Array, " S"]
+    ) -> Packed:
+        return plain_steps(_simulation(tree, leaves), packed, Motion(held, drive), shares)
+
+    @run.def_vmap
+    def over_batch(
+        size: int, batched: Any, leaves: list[Any], *arguments: Any
+    ) -> tuple[Any, tuple[bool, bool]]:
+        """The batch last, where it is of states and motions alone."""
+        if any(batched[0]) or batched[-1]:
+            axes = jax.tree.map(lambda each: 0 if each else None, batched)
+            return jax.vmap(run.fun, axes)(leaves, *arguments), (True, True)
+        *states, shares = arguments
+
+        def last(array: Array, has_batch: bool) -> Array:
+            array = array if has_batch else jnp.broadcast_to(array[None], (size, *array.shape))
+            return jnp.moveaxis(array, 0, -1)
+
+        states = jax.tree.map(last, states, list(batched[1:-1]))
+        moved = run.fun(leaves, *states, shares)
+        return jax.tree.map(lambda array: jnp.moveaxis(array, -1, 0), moved), (True, True)
+
+    return run(leaves, packed, held, drive, shares)
 
 
 Starts = tuple[Float[Array, "segments 3 NHH"], Float[Array, "segments 3 NHH"]]
@@ -72,7 +96,7 @@ def _forward(tree: PyTreeDef, *arguments: Any) -> tuple[Packed, Kept]:
 
         return jax.lax.fori_loop(bounds[0], bounds[1], one, packed), packed
 
-    packed, starts = jax.lax.scan(segment, packed, _segments(len(shares)))
+    packed, starts = jax.lax.scan(segment, packed, jnp.asarray(_segments(len(shares))))
     zeros = jax.tree.map(jnp.zeros_like, leaves) if wanted else None
     return packed, (leaves, motion, shares, starts, zeros)
 
@@ -83,7 +107,7 @@ Bars = tuple[Simulation | None, tuple[Axes, Axes], Float[Array, "3 N"]]
 
 def _backward(
     tree: PyTreeDef, kept: Kept, packed_bar: Any
-) -> tuple[list[Array] | None, Packed, None, Float[Array, "3 N"], None]:
+) -> tuple[list[Any] | None, Packed, None, Float[Array, "3 N"], None]:
     """Segment by segment from the last: its steps again, then their adjoints backwards."""
     leaves, motion, shares, starts, zeros = kept
     simulation = _simulation(tree, leaves)
@@ -119,23 +143,23 @@ def _backward(
 
         return jax.lax.fori_loop(0, end - first, back, (bars, state_at(end - 1)))[0], None
 
-    bars = (
-        simulation_bar,
-        tuple(
-            [bar[axis, halo : halo + count] for axis in range(3)]
-            for bar in jax.tree.map(_dense, packed_bar, is_leaf=_is_zero)
-        ),
-        jnp.zeros_like(motion.drive),
+    position_bar, velocity_bar = (
+        [bar[axis, halo : halo + count] for axis in range(3)]
+        for bar in jax.tree.map(_dense, packed_bar, is_leaf=_is_zero)
     )
-    bars, _ = jax.lax.scan(segment, bars, (segments, starts), reverse=True)
+    bars: Bars = simulation_bar, (position_bar, velocity_bar), jnp.zeros_like(motion.drive)
+    bars, _ = jax.lax.scan(segment, bars, (jnp.asarray(segments), starts), reverse=True)
     simulation_bar, (position_bar, velocity_bar), drive_bar = bars
     padding = ((0, 0), (halo, halo))
     packed_bar = (
         jnp.pad(jnp.stack(position_bar), padding),
         jnp.pad(jnp.stack(velocity_bar), padding),
     )
-    leaves_bar = None if simulation_bar is None else jax.tree.leaves(simulation_bar)
-    return leaves_bar, packed_bar, None, drive_bar, None
+    leaves_bar = [
+        leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else None  # ids have no cotangent
+        for leaf in jax.tree.leaves(simulation_bar)
+    ]
+    return leaves_bar or None, packed_bar, None, drive_bar, None
 
 
 _steps.defvjp(_forward, _backward, symbolic_zeros=True)

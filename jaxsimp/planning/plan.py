@@ -69,6 +69,7 @@ class Planner:
     Attributes:
         task: what is planned for.
         config: settings of the search.
+        layout: of the population on this machine.
         compile_seconds: that compiling the rollouts took.
     """
 
@@ -81,11 +82,12 @@ class Planner:
             layout: of the population on this machine; by default the one measured to be best.
         """
         self.task, self.config = task, config
-        self._physics = task.simulation(), _pickers(task)
+        simulation = task.simulation()
+        self._physics = simulation, _pickers(task)
         shared = (self._physics, self._episode(task.episode_fn(0)))
-        layout = layout or default_layout(config.population)
+        self.layout = layout or default_layout(config.population, simulation)
         one = jax.tree.map(lambda array: array[:1], self._idle())
-        self._costs = PopulationMap(partial(_plan_cost, task), shared, self._idle(), layout)
+        self._costs = PopulationMap(partial(_plan_cost, task), shared, self._idle(), self.layout)
         self._execution = PopulationMap(partial(_execute, task), shared, one, Layout())
         self.compile_seconds = self._costs.compile_seconds + self._execution.compile_seconds
 

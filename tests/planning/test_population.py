@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsimp.body import cloth, rope
+from jaxsimp.dynamics import make_simulation
 from jaxsimp.planning import Layout, PopulationMap, default_layout
 
 LAYOUTS = [Layout(c, w) for c, w in [(1, 1), (1, 2), (3, 1), (3, 2), (8, 3), (1, 3), (50, 2)]]
@@ -129,7 +131,9 @@ def test_a_layout_needs_at_least_one_of_each(chunk_size, num_workers):
 
 
 @pytest.mark.parametrize("population", [1, 2, 128, 333])
-def test_the_default_layout_has_chunks_no_larger_than_a_share(population):
-    layout = default_layout(population)
+@pytest.mark.parametrize("body", [rope(9), cloth((40, 40))], ids=["rope", "large cloth"])
+def test_the_default_layout_has_chunks_no_larger_than_a_share(population, body):
+    layout = default_layout(population, make_simulation(body, 1e-4))
     share = -(-population // layout.num_workers)
     assert 1 <= layout.chunk_size <= share
+    assert layout.chunk_size == 1 or body.num_particles < 1000
