@@ -86,7 +86,7 @@ def test_runs_have_their_schema(folder):
         assert len(row["cost_per_iteration"]) == 2
         assert row["cost_per_iteration"][1] <= row["cost_per_iteration"][0]
         assert row["success"] == (row["final_score"] >= 0.9)
-        assert row["rollouts"] == 8
+        assert row["rollouts"] == 20  # 4 times 4 first, then 4
         assert row["non_finite"] == 0
         assert row["plan_seconds"] > 0
         assert row["compile_seconds"] >= 0
@@ -290,6 +290,7 @@ def test_options_replace_the_settings_of_the_budget():
     assert config == CEMConfig(
         num_iterations=20,
         population=11,
+        initial_populations=1,
         elite_fraction=0.1,
         smoothing=0.3,
         initial_spread=0.5**0.5,

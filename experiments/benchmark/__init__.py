@@ -1,0 +1,1 @@
+"""How fast jaxsimp is on this machine, beside other ways to compute the same."""

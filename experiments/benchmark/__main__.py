@@ -1,0 +1,145 @@
+"""Measure: `python -m experiments.benchmark`; with `--help`, all options."""
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from experiments import records
+from experiments.benchmark import planning, rollouts
+from experiments.benchmark.measure import FULL, QUICK, Row, Scale
+
+SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
+    "step": rollouts.step,
+    "rollout": rollouts.rollout,
+    "population": rollouts.population,
+    "engines": rollouts.engines,
+    "gradient": rollouts.gradient,
+    "cem": planning.cem,
+    "line_fit": planning.line_fit,
+    "cold_start": planning.cold_start,
+    "scaling": rollouts.scaling,
+}
+INTERRUPTED = 130
+"""Exit status of a program that Ctrl-C ended, as shells have it."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How fast jaxsimp is on this machine, beside other ways to compute the same.
+
+    Figures compare within one run: they are taken in turns, on the load that there is.
+    """
+
+    quick: bool = False
+    """Smaller sizes and fewer repeats: every section, in about a minute."""
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A section to run instead of all; give it again for more."""
+    json: Path | None = None
+    """File for the rows."""
+    figures: Path | None = None
+    """Folder for plots."""
+
+    def check(self) -> None:
+        """Refuse what cannot be done, before anything is run.
+
+        Raises:
+            ValueError: if there is no such section, or a path cannot be written to.
+        """
+        unknown = [name for name in self.only if name not in SECTIONS]
+        if unknown:
+            raise ValueError(f"unknown section {unknown[0]!r}; choose from {', '.join(SECTIONS)}")
+        if self.json is not None and self.json.is_dir():
+            raise ValueError(f"{self.json} is a folder; give a file with --json")
+        if self.json is not None and not self.json.parent.is_dir():
+            raise ValueError(f"{self.json.parent} is no folder; make it, or give another --json")
+        if self.figures is not None and self.figures.exists() and not self.figures.is_dir():
+            raise ValueError(f"{self.figures} is a file; give a folder with --figures")
+
+
+def main() -> int:
+    """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
+    options = tyro.cli(Options, prog="python -m experiments.benchmark")
+    console = Console()
+    try:
+        options.check()
+        run(options, QUICK if options.quick else FULL, console)
+    except ValueError as error:
+        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
+        return 2
+    except KeyboardInterrupt:
+        console.print("\ninterrupted; sections that are finished are kept")
+        return INTERRUPTED
+    return 0
+
+
+def run(options: Options, scale: Scale, console: Console) -> list[Row]:
+    """Measure the sections asked for; print a table of each, and write what was asked for."""
+    names = [name for name in SECTIONS if name in options.only or not options.only]
+    environment = records.environment()
+    rows: list[Row] = []
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("", total=len(names))
+        for name in names:
+            progress.update(bar, description=name)
+            found = [row | {"section": name} for row in SECTIONS[name](scale)]
+            progress.advance(bar)
+            console.print(table(name, found))
+            rows.extend(found)
+            if options.json:
+                records.write_json(options.json, {"environment": environment, "rows": rows})
+    if options.figures:
+        # Here, so that --help and wrong options do not wait for matplotlib.
+        from experiments.benchmark.figures import save_figures
+
+        save_figures(rows, options.figures)
+    return rows
+
+
+UNITS = {
+    "compile_seconds": "compile (s)",
+    "run_seconds": "run (ms)",
+    "particle_steps_per_second": "particle-steps (M/s)",
+    "peak_megabytes": "peak (MB)",
+    "error": "error (m)",
+}
+FACTORS = {"run_seconds": 1e3, "particle_steps_per_second": 1e-6}
+HIDDEN = ("section", "chunk_size", "workers", "particle_steps", "checked_against")
+
+
+def table(title: str, rows: list[Row]) -> Table:
+    """Rows for people: the columns in which some row has something."""
+    shown = dict.fromkeys(name for row in rows for name in row if name not in HIDDEN)
+    names = [name for name in shown if any(row.get(name) is not None for row in rows)]
+    made = Table(title=title, title_justify="left")
+    for name in names:
+        number = any(isinstance(row.get(name), (int, float)) for row in rows)
+        heading = UNITS.get(name, name.replace("_", " "))
+        made.add_column(heading, justify="right" if number else "left")
+    for row in rows:
+        made.add_row(*(_cell(name, row.get(name)) for name in names))
+    return made
+
+
+def _cell(name: str, value: Any) -> str:
+    if not isinstance(value, float):
+        return "" if value is None else str(value)
+    if name == "error":
+        return f"{value:.1e}"
+    return f"{value * FACTORS.get(name, 1):.3g}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,203 @@
+"""Sections on what is done with rollouts and around them: CEM, line fits, cold starts."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.benchmark.measure import (
+    Row,
+    Scale,
+    make_row,
+    measured,
+    prepare,
+    time_in_turns,
+)
+from experiments.engines.workload import num_cores
+from jaxsimp.body import rope
+from jaxsimp.planning import ENCODINGS, CEMConfig, Planner
+from jaxsimp.simplify import qp, simplify
+from jaxsimp.simplify.rope import fit_rope, fit_rope_constrained, interpolation_matrix
+from jaxsimp.tasks import Task, make_task
+
+PLANNED_STEPS = (4, 150)
+"""Actions of a planned rollout, the last one with nothing held, and time steps of each."""
+LINE_SIZE = 6
+"""Key points of the lines."""
+
+
+def cem(scale: Scale) -> Iterator[Row]:
+    """An iteration of CEM, and a whole plan of a diagonal fold, with the share of cores busy."""
+    task = fold(scale.cem_side)
+    config = CEMConfig(num_iterations=scale.cem_iterations, population=scale.population)
+    start = time.perf_counter()
+    planner = Planner(task, config)
+    compiling = time.perf_counter() - start
+    candidates = simplify(task.body, task.goal).particles
+    episode, encoding = task.episode_fn(0), ENCODINGS["categorical"]
+    marks: list[tuple[float, float]] = []
+
+    def mark() -> None:
+        marks.append((time.perf_counter(), time.process_time()))
+
+    def run() -> Any:
+        return planner.plan(episode, candidates, encoding, seed=0, on_population=mark)
+
+    ready = prepare(lambda: run)
+    compiling += ready.result.compile_seconds
+    seconds, iterations, busy = [], [], []
+    for _ in range(scale.cem_plans):
+        marks.clear()
+        seconds.append(run().seconds)
+        wall, processor = np.diff(marks, axis=0).T
+        iterations.extend(wall)
+        busy.append(processor.sum() / wall.sum() / num_cores())
+    ready = dataclasses.replace(ready, compile_seconds=compiling)
+    actions, steps = PLANNED_STEPS
+    work = config.population * actions * steps * task.body.num_particles
+    fields = {
+        "engine": "jaxsimp",
+        "body": f"cloth_{scale.cem_side}",
+        "population": config.population,
+        "layout": "default layout",
+        "cpu_share": float(np.median(busy)),
+    }
+    score = planner.execute(episode, ready.result.actions).score
+    rounds = config.num_populations
+    yield make_row("cem_iteration", **fields) | measured(ready, np.array(iterations), work)
+    yield make_row("cem_plan", **fields, rollouts=rounds * config.population, score=score) | (
+        measured(ready, np.array(seconds), rounds * work)
+    )
+
+
+def fold(side: int) -> Task:
+    """The diagonal fold, with rollouts of `PLANNED_STEPS`."""
+    task = make_task("cloth_diagonal_folding", side)
+    actions, steps = PLANNED_STEPS
+    return dataclasses.replace(task, num_actions=actions - 1, action_seconds=steps * task.time_step)
+
+
+def line_fit(scale: Scale) -> Iterator[Row]:
+    """Lines of a few key points fitted to goals of a rope, by each backend."""
+    body = rope(scale.rope)
+    everywhere = np.full(3, np.inf)
+
+    def by_backend(backend: str, goals: np.ndarray) -> Callable[[], np.ndarray]:
+        return lambda: fit_rope_constrained(
+            goals, LINE_SIZE, -everywhere, everywhere, backend=backend
+        )[0]
+
+    def by_product(goals: np.ndarray) -> Callable[[], np.ndarray]:
+        return lambda: np.asarray(fit_rope(goals, LINE_SIZE)[0])
+
+    makes = {name: partial(by_backend, name) for name in qp.BACKENDS}
+    for count in scale.goals:
+        goals = _curves(body.rest, count)
+        expected = np.linalg.pinv(interpolation_matrix(scale.rope, LINE_SIZE)) @ goals
+        ready = [
+            prepare(partial(_compiled, make(goals)))
+            for make in (*makes.values(), partial(by_product))
+        ]
+        times = time_in_turns([each.run for each in ready], scale.repeats)
+        for name, each, seconds in zip((*makes, "fit_rope"), ready, times.T, strict=True):
+            yield make_row(
+                "line_fit",
+                engine=name,
+                body=f"rope_{scale.rope}",
+                goals=count,
+                goals_per_second=count / float(np.median(seconds)),
+                checked_against="pseudo-inverse, float64",
+                error=float(np.abs(each.result - expected).max()),
+            ) | measured(each, seconds)
+
+
+def _compiled(run: Callable[[], Any]) -> Callable[[], Any]:
+    run()
+    return run
+
+
+def _curves(rest: np.ndarray, count: int) -> np.ndarray:
+    """Goals: the rope along smooth random curves, shape (count, N, 3), metres."""
+    random = np.random.default_rng(0)
+    along = np.linspace(0.0, np.pi, len(rest))
+    waves = np.sin(np.arange(1, 4)[:, None] * along)
+    goals = rest + np.einsum("bwa,wn->bna", random.normal(0.0, 0.05, (count, 3, 3)), waves)
+    return goals.astype(np.float32)
+
+
+CACHES = ("no cache", "empty cache", "filled cache")
+COLD_START = """
+import json, sys, time
+start = time.perf_counter()
+import jaxsimp
+imported = time.perf_counter()
+import jaxsimp.planning
+planning = time.perf_counter()
+from experiments.benchmark.planning import fold
+from jaxsimp.planning import CEMConfig, Planner
+planner = Planner(fold(int(sys.argv[1])), CEMConfig(population=int(sys.argv[2])))
+planner.estimate_seconds()
+print(json.dumps({
+    "jaxsimp": imported - start,
+    "jaxsimp.planning": planning - start,
+    "compile": planner.compile_seconds,
+    "all": time.perf_counter() - start,
+}))
+"""
+
+
+def cold_start(scale: Scale) -> Iterator[Row]:
+    """New processes: the import, and all that passes until a population was rolled out once."""
+    found: dict[str, list[dict[str, float]]] = {}
+    for _ in range(scale.cold_starts):
+        with tempfile.TemporaryDirectory() as folder:
+            for cache, path in zip(CACHES, (None, folder, folder), strict=True):
+                found.setdefault(cache, []).append(_start_cold(scale, path))
+    fields = {"engine": "jaxsimp", "body": f"cloth_{scale.cem_side}"}
+    every = [times for all_times in found.values() for times in all_times]
+    for module in ("jaxsimp", "jaxsimp.planning"):
+        yield make_row(
+            "cold_start_import",
+            engine="jaxsimp",
+            layout=f"import {module}",
+            run_seconds=float(np.median([times[module] for times in every])),
+        )
+    for cache, all_times in found.items():
+        yield make_row(
+            "cold_start_population",
+            **fields,
+            population=scale.population,
+            layout=cache,
+            compile_seconds=float(np.median([times["compile"] for times in all_times])),
+            run_seconds=float(np.median([times["all"] for times in all_times])),
+        )
+
+
+def _start_cold(scale: Scale, cache: str | None) -> dict[str, float]:
+    """Seconds of a new process that compiles a planner."""
+    enabled = "false" if cache is None else "true"
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": enabled}
+    if cache is not None:
+        environment |= {
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+    done = subprocess.run(
+        [sys.executable, "-c", COLD_START, str(scale.cem_side), str(scale.population)],
+        cwd=Path(__file__).parents[2],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout.splitlines()[-1])
