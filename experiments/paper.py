@@ -119,6 +119,13 @@ class Study:
         """The search settings of a task."""
         return dataclasses.replace(BUDGETS[self.budget].config(task), **self.settings)
 
+    def identity(self) -> dict[str, Any]:
+        """What two folders of results must share: the options, and what a budget's name means."""
+        search = {
+            name: dataclasses.asdict(self.search_config(self.task(name))) for name in self.tasks
+        }
+        return {**dataclasses.asdict(self), "search": search}
+
     def runs(self, task: str) -> Iterator[tuple[str, str, int]]:
         """Action space, encoding and seed of every run of a task."""
         return itertools.product(self.action_spaces, self.pick_encodings, range(self.seeds))

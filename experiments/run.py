@@ -104,7 +104,7 @@ def main() -> int:
         return 0
     try:
         study = options.configuration()
-        records.open_folder(options.folder, dataclasses.asdict(study))
+        records.open_folder(options.folder, study.identity())
         _run(study, options.folder, console)
     except (ValueError, records.ResultsError) as error:
         Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)

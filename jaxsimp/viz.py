@@ -200,7 +200,9 @@ def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.25) -> No
         ylim=(middle[1] - span[1] / 2, middle[1] + span[1] / 2),
         zlim=(0, span[2]),
     )
-    axes.set_box_aspect(span, zoom=zoom)
+    # The box is scaled by its diagonal; a long one would be cut off at the zoom of a square.
+    slender = np.linalg.norm(span) / (np.sqrt(2) * span.max())
+    axes.set_box_aspect(span, zoom=zoom * min(1.0, slender))
     axes.view_init(elev=50, azim=-65)
     axes.set_axis_off()
 

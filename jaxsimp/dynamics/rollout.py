@@ -1,7 +1,7 @@
 """Rollouts: semi-implicit Euler steps of a simulation under actions, as `jax.lax.scan`.
 
-Pure functions of arrays: `jit`, `vmap` and `grad` apply, in either mode. Gradients store one
-state an action and recompute the steps between (`jax.checkpoint`).
+Pure functions of arrays: `jit`, `vmap` and `grad` apply. Gradients are taken by the adjoint of
+steps.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`.
 """
 
 from collections.abc import Callable
