@@ -38,7 +38,7 @@ LINE_SIZE = 6
 def cem(scale: Scale) -> Iterator[Row]:
     """An iteration of CEM, and a whole plan of a diagonal fold, with the share of cores busy."""
     task = fold(scale.cem_side)
-    config = CEMConfig(num_iterations=scale.cem_iterations, population=scale.population)
+    config = CEMConfig(scale.cem_iterations, scale.population, initial_populations=1)
     start = time.perf_counter()
     planner = Planner(task, config)
     compiling = time.perf_counter() - start
