@@ -66,7 +66,7 @@ class Options:
 def main() -> int:
     """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
     options = tyro.cli(Options, prog="python -m experiments.benchmark")
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else 160)  # a file has no width
     try:
         options.check()
         run(options, QUICK if options.quick else FULL, console)
