@@ -1,7 +1,8 @@
 """The step in Warp on the CPU: a launch runs whole rollouts, and threads share the samples.
 
 Warp runs a launch on one thread, so each of ours launches its part. Measured against a launch a
-step, and against a form that computes a spring's tension once: neither is faster.
+step, and against a form that computes a spring's tension once: on the machine it was
+written on, neither was faster.
 """
 
 import atexit
