@@ -204,11 +204,15 @@ def spring_forces_vjp(
         stiffness_bar.append(own_bar * (1.0 - rest_length * inverse))
         damping_bar.append(own_bar * rate / squared)
         rest_length_bar.append(-own_bar * stiffness * inverse)
+
+    def table(rows: list[Float[Array, " HN"]]) -> Float[Array, "D HN"]:
+        return jnp.asarray(rows).reshape(springs.stiffness.shape)  # there may be no row
+
     springs_bar = dataclasses.replace(
         springs,
-        stiffness=jnp.stack(stiffness_bar),
-        damping=jnp.stack(damping_bar),
-        rest_length=jnp.stack(rest_length_bar),
+        stiffness=table(stiffness_bar),
+        damping=table(damping_bar),
+        rest_length=table(rest_length_bar),
         shortest=shortest_bar,
     )
     position_bar = [

@@ -1,4 +1,4 @@
-"""Many time steps, and their adjoint: gradients in memory of the square root of their number.
+"""The time steps of an action, and their adjoint in memory of the square root of their number.
 
 Reverse mode keeps the states that `sqrt(S)` segments of the S steps start from. Backwards,
 it takes the steps of one segment again, keeping its states, and then their adjoints.
@@ -73,8 +73,6 @@ def _steps(
 
     return run(leaves, packed, held, drive, shares)
 
-
-Starts = tuple[Float[Array, "segments 3 NHH"], Float[Array, "segments 3 NHH"]]
 
 Kept = tuple[list[Any], Any, Any, Any, list[Any] | None]
 """Arguments, states at the start of segments, and zero cotangents of the simulation, if wanted."""

@@ -153,3 +153,29 @@ def test_a_batch_is_a_loop_over_its_samples(stored, by_neighbour):
         np.testing.assert_allclose(both.position[i], loop[i].position, atol=2e-6)
         np.testing.assert_allclose(moves.position[i], alone[i].position, atol=2e-6)
         np.testing.assert_allclose(twice.position[i // 2, i % 2], alone[i].position, atol=2e-6)
+
+
+@pytest.mark.usefixtures("x64")
+def test_gradients_of_a_body_without_springs():
+    body = rope(2, 0.1)
+    none = np.zeros(0)
+    body = replace(
+        body,
+        springs=np.zeros((0, 2), dtype=body.springs.dtype),
+        rest_length=none,
+        stiffness=none,
+        damping=none,
+    )
+    simulation, pickers = make_simulation(body, 1e-3), make_pickers(steps=10)
+    idle = Actions(jnp.full((1, 2), -1), jnp.zeros((1, 2, 3)))
+    start = State(jnp.asarray(body.rest + 1.0), jnp.zeros((2, 3)))
+
+    def height(gravity: jax.Array) -> jax.Array:
+        final, _ = rollout(
+            replace(simulation, gravity=gravity, drag=0.0 * gravity), pickers, start, idle
+        )
+        return final.position[0, 2]
+
+    # Semi-implicit Euler: n steps of dt fall g dt^2 n (n + 1) / 2.
+    found = jax.grad(height)(jnp.array(9.81))
+    np.testing.assert_allclose(found, -1e-6 * 55, rtol=1e-9)
