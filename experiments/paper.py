@@ -265,7 +265,7 @@ def _finite(value: float) -> float | None:
 
 def key_points(task: Task) -> KeyPoints:
     """The key points of a task's goal, the paper's way."""
-    return simplify(task.body, task.goal)
+    return simplify(task.body, task.goal, method="paper")
 
 
 def _identity(row: dict[str, Any]) -> tuple[str, str, str, int]:
@@ -278,6 +278,6 @@ def _model_row(task: str, model: KeyPoints) -> dict[str, Any]:
         "method": model.method,
         "sizes": list(model.sizes),
         "errors": list(model.errors),
-        "threshold": model.threshold,
+        "threshold": model.tolerance,
         "key_points": model.particles.tolist(),
     }

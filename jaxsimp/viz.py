@@ -28,7 +28,7 @@ def plot_model_errors(models: Mapping[str, KeyPoints]) -> "Figure":
     figure, panels = _panels(models)
     for axes, (name, model) in zip(panels, models.items(), strict=True):
         axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
-        axes.axhline(model.threshold * 1e3, color=GOAL_COLOR, ls="--", label="threshold")
+        axes.axhline(model.tolerance * 1e3, color=GOAL_COLOR, ls="--", label="tolerance")
         axes.plot(
             len(model),
             model.error * 1e3,
@@ -42,7 +42,7 @@ def plot_model_errors(models: Mapping[str, KeyPoints]) -> "Figure":
         axes.set(title=_title(name), xlabel="key points", ylabel="model error (mm)")
         axes.set_xticks(np.arange(model.sizes[0], model.sizes[-1] + 1))
         axes.set_xlim(model.sizes[0] - 0.5, model.sizes[-1] + 0.5)
-        axes.set_ylim(bottom=-0.05 * 1e3 * max(*model.errors, model.threshold))
+        axes.set_ylim(bottom=-0.05 * 1e3 * max(*model.errors, model.tolerance))
         axes.legend(frameon=False)
     return figure
 

@@ -27,7 +27,9 @@ def rope_model() -> KeyPoints:
         method="by hand",
         sizes=(2, 3),
         errors=(0.02, 0.001),
-        threshold=0.005,
+        tolerance=0.005,
+        max_error=0.0,
+        rms_error=0.0,
     )
 
 
@@ -40,7 +42,9 @@ def cloth_model() -> KeyPoints:
         method="by hand",
         sizes=(4,),
         errors=(0.0,),
-        threshold=0.005,
+        tolerance=0.005,
+        max_error=0.0,
+        rms_error=0.0,
     )
 
 

@@ -26,7 +26,7 @@ from experiments.engines.workload import num_cores
 from jaxsimp.body import rope
 from jaxsimp.planning import ENCODINGS, CEMConfig, Planner
 from jaxsimp.simplify import qp, simplify
-from jaxsimp.simplify.rope import fit_rope, fit_rope_constrained, interpolation_matrix
+from jaxsimp.simplify.rope_uniform import fit_rope, fit_rope_constrained, interpolation_matrix
 from jaxsimp.tasks import Task, make_task
 
 PLANNED_STEPS = (4, 150)

@@ -2,14 +2,14 @@
 
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions
-from jaxsimp.simplify.cloth import simplify_cloth
+from jaxsimp.simplify.cloth_quadric import simplify_quadric
 from jaxsimp.simplify.keypoints import KeyPoints
-from jaxsimp.simplify.rope import simplify_rope
+from jaxsimp.simplify.rope_uniform import simplify_uniform
 
-__all__ = ["KeyPoints", "simplify", "simplify_cloth", "simplify_rope"]
+__all__ = ["KeyPoints", "simplify", "simplify_quadric", "simplify_uniform"]
 
 # A method is one function for ropes and one for surfaces.
-METHODS = {"paper": (simplify_rope, simplify_cloth)}
+METHODS = {"paper": (simplify_uniform, simplify_quadric)}
 
 
 def simplify(
@@ -17,7 +17,7 @@ def simplify(
     goal: Positions,
     *,
     method: str = "paper",
-    threshold: float | None = None,
+    tolerance: float | None = None,
     max_size: int | None = None,
 ) -> KeyPoints:
     """Key points of a goal: the smallest accurate model of it (section III-A of the paper).
@@ -27,7 +27,7 @@ def simplify(
         goal: goal positions, shape (N, 3), metres.
         method: "paper": evenly spread breakpoints for ropes, quadric edge collapse with the
             Hausdorff distance for surfaces.
-        threshold: error below which a model fits, metres; the method's own by default.
+        tolerance: error below which a model fits, metres; the method's own by default.
         max_size: largest number of key points tried; the method's own by default.
 
     Raises:
@@ -38,4 +38,4 @@ def simplify(
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}")
     simplify_body = METHODS[method][len(body.faces) > 0]
     options = {} if max_size is None else {"max_size": max_size}
-    return simplify_body(body, goal, threshold=threshold, **options)
+    return simplify_body(body, goal, tolerance=tolerance, **options)

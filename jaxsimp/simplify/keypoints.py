@@ -2,14 +2,28 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 
+class Status(IntEnum):
+    """What became of the search for a goal's model."""
+
+    FITS = 0
+    NO_FIT = 1
+    INFEASIBLE = 2
+
+
 @dataclass(frozen=True, eq=False)
 class KeyPoints:
     """The smallest model that fits a goal, as particles of the body.
+
+    A model is piecewise linear in rest coordinates: particles at `W positions`, where row `i` of
+    `W` interpolates between the key points around the rest coordinates of particle `i` (see
+    interpolation.py). That is one notion of error for ropes and surfaces; `errors` are in the
+    norm by which the method chooses.
 
     Attributes:
         particles: ids of the key points in ascending order, shape (K,).
@@ -21,7 +35,12 @@ class KeyPoints:
         sizes: numbers of key points tried, in ascending order: up to the first that fits, and
             a few beyond, which show what more key points would buy.
         errors: error of the model at each size, metres.
-        threshold: error below which a model fits, metres.
+        tolerance: error below which a model fits, metres.
+        max_error: largest distance of a particle from the model, metres.
+        rms_error: root mean square of those distances, metres.
+        certified: whether it is proven that no model with fewer key points fits.
+        status: `FITS`, or why there is no model: where none of the sizes fits it is the last
+            one tried, where constraints contradict each other there are no key points.
     """
 
     particles: Int[np.ndarray, " K"]
@@ -31,7 +50,11 @@ class KeyPoints:
     method: str
     sizes: tuple[int, ...]
     errors: tuple[float, ...]
-    threshold: float
+    tolerance: float
+    max_error: float
+    rms_error: float
+    certified: bool = False
+    status: Status = Status.FITS
 
     def __len__(self) -> int:
         return len(self.particles)
@@ -54,16 +77,16 @@ SIZES_BEYOND = 3
 
 
 def smallest_fit(
-    error_fn: Callable[[int], float], sizes: Iterable[int], threshold: float
+    error_fn: Callable[[int], float], sizes: Iterable[int], tolerance: float
 ) -> tuple[int | None, dict[int, float]]:
-    """The first size whose error is below the threshold, and the errors of all sizes tried.
+    """The first size whose error is below the tolerance, and the errors of all sizes tried.
 
     Sizes are tried one by one, since errors need not fall with every further key point.
 
     Args:
         error_fn: error of the model of a size, metres.
         sizes: in ascending order.
-        threshold: metres.
+        tolerance: metres.
 
     Returns:
         The size, None if no model fits, and the errors by size, `SIZES_BEYOND` further than
@@ -73,7 +96,7 @@ def smallest_fit(
     fitting: list[int] = []
     for size in sizes:
         errors[size] = error_fn(size)
-        if fitting or errors[size] < threshold:
+        if fitting or errors[size] < tolerance:
             fitting.append(size)
         if len(fitting) > SIZES_BEYOND:
             break

@@ -63,7 +63,7 @@ def test_summary_has_its_schema(folder):
         assert model["method"]
         assert len(model["sizes"]) == len(model["errors"]) > 0
         # The first size that fits is the one chosen; others are there to be shown.
-        fits = [error < model["threshold"] for error in model["errors"]]
+        fits = [error < model["tolerance"] for error in model["errors"]]
         assert len(model["key_points"]) == model["sizes"][fits.index(True)]
         particles = make_task(model["task"], 9).body.num_particles
         assert set(model["key_points"]) <= set(range(particles))

@@ -14,7 +14,9 @@ def key_points(particles, num_particles=6):
         method="by hand",
         sizes=(len(particles),),
         errors=(0.0,),
-        threshold=1.0,
+        tolerance=1.0,
+        max_error=0.0,
+        rms_error=0.0,
     )
 
 
@@ -37,15 +39,15 @@ def test_mask_selects_the_particles_of_an_action():
 
 def test_the_smallest_fit_is_the_first_and_a_few_sizes_beyond_are_tried():
     errors = {2: 5.0, 3: 0.5, 4: 2.0, 5: 0.4, 6: 0.3, 7: 0.2, 8: 0.1}
-    size, tried = smallest_fit(errors.__getitem__, errors, threshold=1.0)
+    size, tried = smallest_fit(errors.__getitem__, errors, tolerance=1.0)
     assert size == 3  # the size of 4 that does not fit again changes nothing
     assert list(tried) == [2, 3, 4, 5, 6]
     assert len(tried) - 2 == SIZES_BEYOND
 
 
 def test_no_fit_is_none_with_every_error():
-    assert smallest_fit(float, range(2, 5), threshold=1.0) == (None, {2: 2.0, 3: 3.0, 4: 4.0})
+    assert smallest_fit(float, range(2, 5), tolerance=1.0) == (None, {2: 2.0, 3: 3.0, 4: 4.0})
 
 
 def test_a_fit_at_the_last_size_is_found():
-    assert smallest_fit(lambda size: 4.0 - size, range(2, 5), threshold=1.0)[0] == 4
+    assert smallest_fit(lambda size: 4.0 - size, range(2, 5), tolerance=1.0)[0] == 4

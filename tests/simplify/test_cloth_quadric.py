@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxsimp import body, goals
-from jaxsimp.simplify import simplify, simplify_cloth
-from jaxsimp.simplify.cloth import collapse_sequence, follow_creases
+from jaxsimp.simplify import simplify, simplify_quadric
+from jaxsimp.simplify.cloth_quadric import collapse_sequence, follow_creases
 from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
 
 HALF = 0.15
@@ -56,43 +56,43 @@ def crumpled(rng, count=7):
 
 @pytest.mark.parametrize("direction", [(0, 1), (1, 0), (1, 1), (1, -1)])
 def test_folds_of_the_paper_have_its_key_points(direction):
-    assert_paper(simplify_cloth(cloth(25), folded(25, direction)), 25, direction)
+    assert_paper(simplify_quadric(cloth(25), folded(25, direction)), 25, direction)
 
 
 @pytest.mark.parametrize("count", [9, 12, 13])
 @pytest.mark.parametrize("direction", FOLDS)
 def test_other_meshes_have_the_same_key_points(count, direction):
-    assert_paper(simplify_cloth(cloth(count), folded(count, direction)), count, direction)
+    assert_paper(simplify_quadric(cloth(count), folded(count, direction)), count, direction)
 
 
 @given(direction=st.sampled_from(list(FOLDS)), angle=st.floats(0, 2 * np.pi))
 @settings(max_examples=8)
 def test_a_turned_goal_has_the_same_key_points(direction, angle):
-    assert_paper(simplify_cloth(cloth(13), folded(13, direction, angle)), 13, direction)
+    assert_paper(simplify_quadric(cloth(13), folded(13, direction, angle)), 13, direction)
 
 
 def test_a_flat_sheet_has_its_corners():
-    points = simplify_cloth(cloth(13), goals.flat(cloth(13), 0.4))
+    points = simplify_quadric(cloth(13), goals.flat(cloth(13), 0.4))
     assert points.particles.tolist() == [0, 12, 156, 168]
     assert points.errors[0] == pytest.approx(0.0, abs=1e-7)  # square root of 1e-14
-    assert points.threshold == pytest.approx(0.03)
+    assert points.tolerance == pytest.approx(0.03)
 
 
 @given(seeds)
 @settings(max_examples=10)
 def test_key_points_are_particles_where_the_goal_has_them(seed):
     goal = crumpled(np.random.default_rng(seed))
-    points = simplify_cloth(cloth(7), goal, threshold=0.04, max_size=49)  # all of them fit
+    points = simplify_quadric(cloth(7), goal, tolerance=0.04, max_size=49)  # all of them fit
     assert np.array_equal(points.positions, goal[points.particles])
     assert (np.diff(points.particles) > 0).all()
     assert np.array_equal(np.unique(points.elements), np.arange(len(points)))
     assert points.sizes == tuple(range(points.sizes[0], points.sizes[-1] + 1))
     before = points.errors[: points.sizes.index(len(points))]
-    assert points.error < points.threshold <= min(before, default=np.inf)
+    assert points.error < points.tolerance <= min(before, default=np.inf)
     model = Surface(points.positions, points.elements)
     original = Surface(goal, cloth(7).faces)
     # Distances from the same samples, written with other vertex ids.
-    sampling = max(points.threshold / 10, cloth(7).spacing / 8)
+    sampling = max(points.tolerance / 10, cloth(7).spacing / 8)
     measured = hausdorff_distance(original, model, sampling)
     assert measured == pytest.approx(points.error, abs=1e-9)
 
@@ -205,7 +205,7 @@ def test_a_motion_in_space_changes_nothing():
     goal = crumpled(rng)
     turn = Rotation.random(rng=rng).as_matrix()
     moved = goal @ turn.T + [3.0, -2.0, 5.0]
-    first, second = (simplify_cloth(cloth(7), g) for g in (goal, moved))
+    first, second = (simplify_quadric(cloth(7), g) for g in (goal, moved))
     assert np.array_equal(first.particles, second.particles)
     assert np.allclose(first.errors, second.errors, rtol=0.0, atol=2e-3)  # twice the bound
 
@@ -255,17 +255,17 @@ def test_triangles_that_follow_the_crease_are_left_alone(direction):
 def test_a_goal_in_one_line_or_point_does_not_fail():
     line = goals.flat(cloth(5)) * [1, 0, 0]
     with pytest.raises(ValueError, match="no mesh of up to 24 key points"):
-        simplify_cloth(cloth(5), line, threshold=1e-6)
+        simplify_quadric(cloth(5), line, tolerance=1e-6)
     point = np.zeros((25, 3))
     with pytest.raises(ValueError, match="the mesh allows none"):
-        simplify_cloth(cloth(5), point)
+        simplify_quadric(cloth(5), point)
 
 
-def test_no_fit_names_the_best_error_the_threshold_and_the_remedy():
+def test_no_fit_names_the_best_error_the_tolerance_and_the_remedy():
     goal = crumpled(np.random.default_rng(2))
-    message = r"up to 5 key points .* threshold of 1e-05 m: .* off by 0\.\d+ m; raise threshold"
+    message = r"up to 5 key points .* tolerance of 1e-05 m: .* off by 0\.\d+ m; raise tolerance"
     with pytest.raises(ValueError, match=message):
-        simplify_cloth(cloth(7), goal, threshold=1e-5, max_size=5)
+        simplify_quadric(cloth(7), goal, tolerance=1e-5, max_size=5)
 
 
 def test_the_entry_takes_a_cloth():
@@ -277,18 +277,18 @@ def test_the_entry_takes_a_cloth():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"threshold": -1.0}, "threshold is -1; give a distance above zero"),
+        ({"tolerance": -1.0}, "tolerance is -1; give a distance above zero"),
         ({"max_size": 3}, "max_size is 3; at least 4"),
     ],
 )
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        simplify_cloth(cloth(5), goals.flat(cloth(5)), **options)
+        simplify_quadric(cloth(5), goals.flat(cloth(5)), **options)
 
 
 def test_bad_arguments_are_refused():
     rope = body.rope()
     with pytest.raises(ValueError, match="the rope has 0 triangles; give a surface"):
-        simplify_cloth(rope, goals.straight(rope))
+        simplify_quadric(rope, goals.straight(rope))
     with pytest.raises(ValueError, match=r"the goal has shape \(3, 3\); \(25, 3\)"):
-        simplify_cloth(cloth(5), np.zeros((3, 3)))
+        simplify_quadric(cloth(5), np.zeros((3, 3)))

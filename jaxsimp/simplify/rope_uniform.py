@@ -15,14 +15,15 @@ from jaxtyping import Array, Float, Int
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions, check_goal
 from jaxsimp.simplify import qp
+from jaxsimp.simplify.interpolation import model_errors
 from jaxsimp.simplify.keypoints import KeyPoints, smallest_fit
 
 
-def simplify_rope(
+def simplify_uniform(
     body: Body,
     goal: Positions,
     *,
-    threshold: float | None = None,
+    tolerance: float | None = None,
     max_size: int = 20,
     above_table: bool = False,
     workspace: Float[np.ndarray, "2 3"] | None = None,
@@ -38,7 +39,7 @@ def simplify_rope(
     Args:
         body: a rope.
         goal: goal positions, shape (N, 3), metres.
-        threshold: error below which a fit is accepted, metres; 0.015 of the rope's length
+        tolerance: error below which a fit is accepted, metres; 0.015 of the rope's length
             by default.
         max_size: largest number of key points tried; no more than N are.
         above_table: keep the model a radius above z = 0.
@@ -47,12 +48,12 @@ def simplify_rope(
 
     Raises:
         ValueError: if the body has triangles, the goal is not one of this body, the
-            threshold is not above zero, `max_size` is below 2, the constraints contradict
+            tolerance is not above zero, `max_size` is below 2, the constraints contradict
             each other, or no fit of up to `max_size` key points is close enough.
     """
     goal = check_goal(body, goal)
-    threshold = 0.015 * body.size if threshold is None else threshold
-    _check_options(body, threshold, max_size)
+    tolerance = 0.015 * body.size if tolerance is None else tolerance
+    _check_options(body, tolerance, max_size)
     lower, upper = _box(body, above_table, workspace)
     constrained = fixed_ends or bool(np.isfinite([lower, upper]).any())
 
@@ -62,22 +63,26 @@ def simplify_rope(
         return _fit_one(goal, size)
 
     sizes = range(2, min(max_size, body.num_particles) + 1)
-    size, errors = smallest_fit(lambda size: fit(size)[1], sizes, threshold)
+    size, errors = smallest_fit(lambda size: fit(size)[1], sizes, tolerance)
     if size is None:
         raise ValueError(
-            f"no fit of up to {sizes[-1]} key points is within the threshold of "
-            f"{threshold:.3g} m: the best is off by {min(errors.values()):.3g} m; raise "
-            f"threshold or max_size"
+            f"no fit of up to {sizes[-1]} key points is within the tolerance of "
+            f"{tolerance:.3g} m: the best is off by {min(errors.values()):.3g} m; raise "
+            f"tolerance or max_size"
         )
+    positions, _ = fit(size)
+    largest, mean = model_errors(goal, interpolation_matrix(len(goal), size), positions)
     return KeyPoints(
         particles=breakpoint_particles(body.num_particles, size),
-        positions=fit(size)[0],
+        positions=positions,
         elements=np.stack([np.arange(size - 1), np.arange(1, size)], axis=1),
         num_particles=body.num_particles,
         method="uniform breakpoints",
         sizes=tuple(errors),
         errors=tuple(errors.values()),
-        threshold=threshold,
+        tolerance=tolerance,
+        max_error=largest,
+        rms_error=mean,
     )
 
 
@@ -243,12 +248,10 @@ def _fit_one_constrained(
     return positions[0], float(error[0])
 
 
-def _check_options(body: Body, threshold: float, max_size: int) -> None:
+def _check_options(body: Body, tolerance: float, max_size: int) -> None:
     if len(body.faces):
-        raise ValueError(
-            f"the {body.name} has {len(body.faces)} triangles; give a rope, or use simplify_cloth"
-        )
-    if not 0 < threshold < np.inf:
-        raise ValueError(f"threshold is {threshold:g}; give a distance above zero, in metres")
+        raise ValueError(f"the {body.name} has {len(body.faces)} triangles; give a rope")
+    if not 0 < tolerance < np.inf:
+        raise ValueError(f"tolerance is {tolerance:g}; give a distance above zero, in metres")
     if max_size < 2:
         raise ValueError(f"max_size is {max_size}; at least 2 is needed")

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions, check_goal
 from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
+from jaxsimp.simplify.interpolation import interpolation_weights, model_errors
 from jaxsimp.simplify.keypoints import KeyPoints, smallest_fit
 
 MIN_SIZE = 4  # two triangles, where the paper starts
@@ -28,18 +29,18 @@ LEAST_GAIN = 0.1  # of strain, for an edge to be replaced; rounding must not dec
 ROUNDING = 1e-10  # quadric errors below this are rounding
 
 
-def simplify_cloth(
+def simplify_quadric(
     body: Body,
     goal: Positions,
     *,
-    threshold: float | None = None,
+    tolerance: float | None = None,
     max_size: int = 24,
 ) -> KeyPoints:
     """Key points of a surface: the vertices of the smallest mesh that covers the goal.
 
     The goal's mesh is decimated once, down to four vertices where its topology allows;
     the sizes on the way are compared with the goal from the smallest up. The error is the
-    Hausdorff distance, surface to surface, from samples that are a tenth of the threshold
+    Hausdorff distance, surface to surface, from samples that are a tenth of the tolerance
     apart, or an eighth of the body's spacing if that is more: it may be below the true
     distance by 0.58 of that.
 
@@ -50,38 +51,43 @@ def simplify_cloth(
     Args:
         body: a body with triangles.
         goal: goal positions, shape (N, 3), metres.
-        threshold: Hausdorff distance below which a mesh fits, metres; a tenth of the
+        tolerance: Hausdorff distance below which a mesh fits, metres; a tenth of the
             body's size by default.
         max_size: largest number of key points tried.
 
     Raises:
         ValueError: if the body has no triangles, the goal is not one of this body, the
-            threshold is not above zero, `max_size` is below 4, or no mesh of up to
+            tolerance is not above zero, `max_size` is below 4, or no mesh of up to
             `max_size` key points fits.
     """
     goal = check_goal(body, goal)
-    threshold = 0.1 * body.size if threshold is None else threshold
-    _check_options(body, threshold, max_size)
+    tolerance = 0.1 * body.size if tolerance is None else tolerance
+    _check_options(body, tolerance, max_size)
     meshes = collapse_sequence(goal, follow_creases(body, goal), max_size)
     original = Surface(goal, body.faces)
-    sampling = max(threshold / 10, body.spacing / 8)
+    sampling = max(tolerance / 10, body.spacing / 8)
 
     def error(size: int) -> float:
         return hausdorff_distance(original, Surface(goal, meshes[size]), sampling)
 
-    size, errors = smallest_fit(error, sorted(meshes), threshold)
+    size, errors = smallest_fit(error, sorted(meshes), tolerance)
     if size is None:
-        raise ValueError(_no_fit(errors, threshold, max_size))
+        raise ValueError(_no_fit(errors, tolerance, max_size))
     particles, elements = np.unique(meshes[size], return_inverse=True)
+    elements = elements.reshape(-1, 3)
+    weights = interpolation_weights(body.rest, particles, elements)
+    largest, mean = model_errors(goal, weights, goal[particles])
     return KeyPoints(
         particles=particles,
         positions=goal[particles],
-        elements=elements.reshape(-1, 3),
+        elements=elements,
         num_particles=body.num_particles,
         method="quadric collapse",
         sizes=tuple(errors),
         errors=tuple(errors.values()),
-        threshold=threshold,
+        tolerance=tolerance,
+        max_error=largest,
+        rms_error=mean,
     )
 
 
@@ -344,20 +350,20 @@ def _homogeneous(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
 
 
-def _check_options(body: Body, threshold: float, max_size: int) -> None:
+def _check_options(body: Body, tolerance: float, max_size: int) -> None:
     if len(body.faces) == 0:
-        raise ValueError(f"the {body.name} has 0 triangles; give a surface, or use simplify_rope")
-    if not 0 < threshold < np.inf:
-        raise ValueError(f"threshold is {threshold:g}; give a distance above zero, in metres")
+        raise ValueError(f"the {body.name} has 0 triangles; give a body with triangles")
+    if not 0 < tolerance < np.inf:
+        raise ValueError(f"tolerance is {tolerance:g}; give a distance above zero, in metres")
     if max_size < MIN_SIZE:
         raise ValueError(f"max_size is {max_size}; at least {MIN_SIZE} is needed")
 
 
-def _no_fit(errors: dict[int, float], threshold: float, max_size: int) -> str:
+def _no_fit(errors: dict[int, float], tolerance: float, max_size: int) -> str:
     best = "the mesh allows none"
     if errors:
         best = f"the best is off by {min(errors.values()):.3g} m"
     return (
-        f"no mesh of up to {max_size} key points is within the threshold of {threshold:.3g} m: "
-        f"{best}; raise threshold or max_size"
+        f"no mesh of up to {max_size} key points is within the tolerance of {tolerance:.3g} m: "
+        f"{best}; raise tolerance or max_size"
     )

@@ -6,10 +6,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxsimp import body, goals
-from jaxsimp.simplify import simplify, simplify_rope
+from jaxsimp.simplify import simplify, simplify_uniform
 from jaxsimp.simplify.keypoints import SIZES_BEYOND
 from jaxsimp.simplify.qp import Status
-from jaxsimp.simplify.rope import (
+from jaxsimp.simplify.rope_uniform import (
     breakpoint_particles,
     fit_rope,
     fit_rope_constrained,
@@ -158,11 +158,11 @@ def test_an_infeasible_goal_is_a_status_and_leaves_the_others_alone():
 
 
 def test_a_straight_rope_needs_its_ends():
-    points = simplify_rope(ROPE, goals.straight(ROPE))
+    points = simplify_uniform(ROPE, goals.straight(ROPE))
     assert points.particles.tolist() == [0, 40]
     assert points.elements.tolist() == [[0, 1]]
     assert points.positions == pytest.approx(goals.straight(ROPE)[[0, 40]], abs=SINGLE)
-    assert points.threshold == pytest.approx(0.015 * 0.5)
+    assert points.tolerance == pytest.approx(0.015 * 0.5)
 
 
 @pytest.mark.parametrize(
@@ -177,12 +177,12 @@ def test_polylines_of_equal_legs_give_their_corners(corners, particles):
     corners = np.array(corners, dtype=float)
     corners *= 0.5 / np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
     goal = goals.polyline(ROPE, corners)
-    points = simplify_rope(ROPE, goal)
+    points = simplify_uniform(ROPE, goal)
     assert points.particles.tolist() == particles
     assert points.sizes == tuple(range(2, len(particles) + 1 + SIZES_BEYOND))
     assert points.positions[:, :2] == pytest.approx(corners, abs=10 * SINGLE)
     before = points.errors[: points.sizes.index(len(particles))]
-    assert points.error < points.threshold <= min(before)
+    assert points.error < points.tolerance <= min(before)
 
 
 def test_every_size_is_tried_since_errors_are_not_monotone():
@@ -191,7 +191,7 @@ def test_every_size_is_tried_since_errors_are_not_monotone():
     assert errors[0] < SINGLE
     assert errors[2] < SINGLE
     assert errors[1] > 1e-3
-    points = simplify_rope(ROPE, goal, threshold=1e-4)
+    points = simplify_uniform(ROPE, goal, tolerance=1e-4)
     assert points.sizes == (2, 3, 4, 5, 6)
     assert len(points) == 3
 
@@ -199,7 +199,7 @@ def test_every_size_is_tried_since_errors_are_not_monotone():
 def test_far_from_the_origin_float32_is_as_good():
     goal = goals.polyline(ROPE, np.array([[0, 0], [0.25, 0], [0.25, 0.25]]))
     goal = goal + np.array([1e4, -1e4, 0])
-    points = simplify_rope(ROPE, goal, threshold=1e-5)  # float32 at 1e4 m steps by 1e-3 m
+    points = simplify_uniform(ROPE, goal, tolerance=1e-5)  # float32 at 1e4 m steps by 1e-3 m
     assert len(points) == 3
 
 
@@ -216,15 +216,15 @@ def test_key_particles_are_the_nearest_by_id(count, size):
 def test_constraints_reach_the_key_points():
     goal = goals.straight(ROPE)
     goal[:, 2] -= 0.01
-    low = simplify_rope(ROPE, goal, threshold=0.02)
-    high = simplify_rope(ROPE, goal, threshold=0.02, above_table=True)
+    low = simplify_uniform(ROPE, goal, tolerance=0.02)
+    high = simplify_uniform(ROPE, goal, tolerance=0.02, above_table=True)
     assert low.positions[:, 2].max() < 0
     assert high.positions[:, 2] == pytest.approx(ROPE.radius, abs=EXACT)
     workspace = np.array([[-0.24, -1, -1], [0.24, 1, 1]])
-    boxed = simplify_rope(ROPE, goal, threshold=0.02, workspace=workspace)
+    boxed = simplify_uniform(ROPE, goal, tolerance=0.02, workspace=workspace)
     assert np.abs(boxed.positions[:, 0]).max() <= 0.24 + EXACT
     bent = goals.polyline(ROPE, np.array([[0, 0], [0.3, 0], [0.3, 0.2]]))
-    fixed = simplify_rope(ROPE, bent, fixed_ends=True)
+    fixed = simplify_uniform(ROPE, bent, fixed_ends=True)
     assert fixed.positions[[0, -1]] == pytest.approx(bent[[0, -1]], abs=EXACT)
 
 
@@ -232,46 +232,46 @@ def test_contradictory_constraints_are_refused_with_a_remedy():
     goal = goals.straight(ROPE)
     goal[0, 2] = -0.1
     with pytest.raises(ValueError, match=r"INFEASIBLE; widen the workspace"):
-        simplify_rope(ROPE, goal, above_table=True, fixed_ends=True)
+        simplify_uniform(ROPE, goal, above_table=True, fixed_ends=True)
 
 
-def test_no_fit_names_the_best_error_the_threshold_and_the_remedy():
+def test_no_fit_names_the_best_error_the_tolerance_and_the_remedy():
     goal = random_goals(np.random.default_rng(4), batch=1)[0]
-    message = r"up to 3 key points .* threshold of 1e-09 m: .* off by 0\.\d+ m; raise threshold"
+    message = r"up to 3 key points .* tolerance of 1e-09 m: .* off by 0\.\d+ m; raise tolerance"
     with pytest.raises(ValueError, match=message):
-        simplify_rope(ROPE, goal, threshold=1e-9, max_size=3)
+        simplify_uniform(ROPE, goal, tolerance=1e-9, max_size=3)
 
 
 def test_more_key_points_than_particles_are_never_tried():
     small = body.rope(num_particles=4, length=0.3)
     goal = np.random.default_rng(5).normal(size=(4, 3))
-    points = simplify_rope(small, goal, threshold=1e-3, max_size=50)
+    points = simplify_uniform(small, goal, tolerance=1e-3, max_size=50)
     assert points.particles.tolist() == [0, 1, 2, 3]
 
 
 def test_the_entry_takes_a_rope():
     goal = goals.straight(ROPE)
     assert simplify(ROPE, goal).particles.tolist() == [0, 40]
-    assert simplify(ROPE, goal, threshold=0.1, max_size=2).threshold == 0.1
+    assert simplify(ROPE, goal, tolerance=0.1, max_size=2).tolerance == 0.1
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"threshold": 0.0}, "threshold is 0; give a distance above zero"),
-        ({"threshold": float("nan")}, "threshold is nan"),
+        ({"tolerance": 0.0}, "tolerance is 0; give a distance above zero"),
+        ({"tolerance": float("nan")}, "tolerance is nan"),
         ({"max_size": 1}, "max_size is 1; at least 2"),
     ],
 )
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        simplify_rope(ROPE, goals.straight(ROPE), **options)
+        simplify_uniform(ROPE, goals.straight(ROPE), **options)
 
 
 def test_bad_arguments_are_refused():
     cloth = body.cloth((3, 3))
-    with pytest.raises(ValueError, match=r"8 triangles; give a rope, or use simplify_cloth"):
-        simplify_rope(cloth, goals.flat(cloth))
+    with pytest.raises(ValueError, match=r"8 triangles; give a rope, or use simplify_quadric"):
+        simplify_uniform(cloth, goals.flat(cloth))
     goal = goals.straight(ROPE)
     goal[7] = np.nan
     with pytest.raises(ValueError, match=r"particle 7 is .* finite"):
