@@ -288,7 +288,7 @@ def test_bad_options_are_refused(options, message):
 
 def test_bad_arguments_are_refused():
     rope = body.rope()
-    with pytest.raises(ValueError, match="the rope has 0 triangles; give a surface"):
+    with pytest.raises(ValueError, match="the rope has 0 triangles; give a body with triangles"):
         simplify_quadric(rope, goals.straight(rope))
     with pytest.raises(ValueError, match=r"the goal has shape \(3, 3\); \(25, 3\)"):
         simplify_quadric(cloth(5), np.zeros((3, 3)))
