@@ -139,22 +139,26 @@ def pull(
 
 
 def _pull(
-    springs: Springs, weights: list[Float[Array, "HN *B"]], values: Float[Array, "NHH *B"]
+    springs: Springs,
+    weights: list[Float[Array, "HN *B"]],
+    values: Float[Array, "NHH *B"],
+    sign: int = 1,
 ) -> Float[Array, "N *B"]:
+    """`pull` along one axis, times `sign`, 1 or -1; see `_subtract`."""
     halo = springs.halo
     end = len(values) - halo
     here = slice(halo, end)
     total = jnp.zeros_like(values[here])
     if not springs.offsets:
         for row, weight in enumerate(weights):
-            total = total + weight * (_neighbours(springs, row, values) - values)
+            total = total + weight * _subtract(_neighbours(springs, row, values), values, sign)
         return total
     for offset, weight in zip(springs.offsets, weights, strict=True):
         after, before = slice(halo + offset, end + offset), slice(halo - offset, end - offset)
         total = (
             total
-            + weight[here] * (values[after] - values[here])
-            - weight[before] * (values[here] - values[before])
+            + weight[here] * _subtract(values[after], values[here], sign)
+            + weight[before] * _subtract(values[before], values[here], sign)
         )
     return total
 
@@ -165,8 +169,8 @@ def spring_forces_vjp(
     position: Float[Array, "3 NHH *B"],
     velocity: Float[Array, "3 NHH *B"],
     force_bar: Float[Array, "3 NHH *B"],
-) -> tuple[Springs, list[Float[Array, "N *B"]], list[Float[Array, "N *B"]]]:
-    """Cotangents of springs, positions and velocities for one of the spring forces.
+) -> tuple[list[Float[Array, "N *B"]], list[Float[Array, "N *B"]]]:
+    """Cotangents of positions and velocities for one of the spring forces.
 
     Let `d`, `w` and `e` be the differences of position, velocity and `force_bar` between a
     spring's ends. The force on its first end is `t d`, so the cotangent of `t` is `-e.d`, and
@@ -175,7 +179,8 @@ def spring_forces_vjp(
         -t e + a w + b d  and  a d,  with  a = -(e.d) dt/d(d.w),  b = -2 (e.d) dt/d(d.d):
 
     the cotangents of particles are pulls with the weights t, a and b. JAX's own transpose turns
-    every shifted slice into a padded copy, and is many times slower.
+    every shifted slice into a padded copy, and is many times slower. The differences of positions
+    are written in a form of its own for each of the loops that take them, see `_subtract`.
 
     Args:
         springs: of the body.
@@ -185,56 +190,103 @@ def spring_forces_vjp(
         force_bar: cotangent of the forces, with halo.
     """
     by_rate, by_square = [], []
-    stiffness_bar, damping_bar, rest_length_bar = [], [], []
-    shortest_bar = jnp.zeros_like(springs.shortest)
     for row, tension in enumerate(tensions):
-        along, speed = _difference(springs, row, position), _difference(springs, row, velocity)
-        stiffness, damping, rest_length = _row(springs, row, along[0])
-        tension_bar = -_dot(along, _difference(springs, row, force_bar))
-        # A spring that is stored twice acts on one end each time.
-        own_bar = tension_bar if springs.offsets else _dot(along, list(force_bar))
-        square, least, rate = _dot(along, along), springs.shortest**2, _dot(along, speed)
-        squared, regular = jnp.maximum(square, least), square > least
-        curvature = (stiffness - tension) * squared - damping * rate
-        by_rate.append(tension_bar * damping / squared)
-        by_square.append(jnp.where(regular, tension_bar, 0.0) * curvature / (squared * squared))
-        slope = jnp.where(regular, 0.0, own_bar) * curvature / (squared * squared)
-        shortest_bar += springs.shortest * slope.sum()
-        inverse = 1.0 / jnp.sqrt(squared)
-        stiffness_bar.append(own_bar * (1.0 - rest_length * inverse))
-        damping_bar.append(own_bar * rate / squared)
-        rest_length_bar.append(-own_bar * stiffness * inverse)
-
-    def table(rows: list[Float[Array, " HN"]]) -> Float[Array, "D HN"]:
-        return jnp.asarray(rows).reshape(springs.stiffness.shape)  # there may be no row
-
-    springs_bar = dataclasses.replace(
-        springs,
-        stiffness=table(stiffness_bar),
-        damping=table(damping_bar),
-        rest_length=table(rest_length_bar),
-        shortest=shortest_bar,
-    )
+        away = _difference(springs, row, position, sign=-1)
+        apart = _difference(springs, row, force_bar)
+        together = _difference_together(springs, row, position)
+        along = [together[axis] for axis in range(3)]
+        stiffness, damping, rest_length = _row(springs, row, tension)
+        least = springs.shortest**2
+        share = _dot(away, apart) / jnp.maximum(_dot(away, away), least)
+        by_rate.append(damping * share)
+        square = _dot(along, along)
+        length = jnp.sqrt(jnp.maximum(square, least))
+        slope = 2.0 * (stiffness - tension) * length - stiffness * rest_length
+        by_square.append(jnp.where(square > least, share, 0.0) * slope / length)
     position_bar = [
         _pull(springs, tensions, force_bar[axis])
         - _pull(springs, by_rate, velocity[axis])
         - _pull(springs, by_square, position[axis])
         for axis in range(3)
     ]
-    velocity_bar = [-_pull(springs, by_rate, position[axis]) for axis in range(3)]
-    return springs_bar, position_bar, velocity_bar
+    velocity_bar = [_pull(springs, by_rate, position[axis], sign=-1) for axis in range(3)]
+    return position_bar, velocity_bar
+
+
+def springs_vjp(
+    springs: Springs,
+    tensions: list[Float[Array, " HN"]],
+    position: Float[Array, "3 NHH"],
+    velocity: Float[Array, "3 NHH"],
+    force_bar: Float[Array, "3 NHH"],
+) -> Springs:
+    """Cotangents of the springs themselves for one of their forces; see `spring_forces_vjp`."""
+    stiffness_bar, damping_bar, rest_length_bar = [], [], []
+    shortest_bar = jnp.zeros_like(springs.shortest)
+    for row, tension in enumerate(tensions):
+        along, speed = _difference(springs, row, position), _difference(springs, row, velocity)
+        stiffness, damping, rest_length = _row(springs, row, along[0])
+        # A spring that is stored twice acts on one end each time.
+        apart = _difference(springs, row, force_bar) if springs.offsets else list(-force_bar)
+        tension_bar = -_dot(along, apart)
+        square, least, rate = _dot(along, along), springs.shortest**2, _dot(along, speed)
+        squared = jnp.maximum(square, least)
+        curvature = (stiffness - tension) * squared - damping * rate
+        short = jnp.where(square > least, 0.0, tension_bar)
+        shortest_bar += springs.shortest * (short * curvature / (squared * squared)).sum()
+        inverse = 1.0 / jnp.sqrt(squared)
+        stiffness_bar.append(tension_bar * (1.0 - rest_length * inverse))
+        damping_bar.append(tension_bar * rate / squared)
+        rest_length_bar.append(-tension_bar * stiffness * inverse)
+
+    def table(rows: list[Float[Array, " HN"]]) -> Float[Array, "D HN"]:
+        return jnp.asarray(rows).reshape(springs.stiffness.shape)  # there may be no row
+
+    return dataclasses.replace(
+        springs,
+        stiffness=table(stiffness_bar),
+        damping=table(damping_bar),
+        rest_length=table(rest_length_bar),
+        shortest=shortest_bar,
+    )
 
 
 def _difference(
-    springs: Springs, row: int, values: Float[Array, "3 NHH *B"]
+    springs: Springs, row: int, values: Float[Array, "3 NHH *B"], sign: int = 1
 ) -> list[Float[Array, "HN *B"]]:
-    """Along each axis: `value_other - value_self` of the springs of one row."""
+    """Along each axis: `value_other - value_self` of the springs of one row, times `sign`."""
     # Component by component: XLA does not vectorise a sum over the first axis.
     if not springs.offsets:
-        return [_neighbours(springs, row, values[axis]) - values[axis] for axis in range(3)]
+        return [
+            _subtract(_neighbours(springs, row, values[axis]), values[axis], sign)
+            for axis in range(3)
+        ]
     offset = springs.offsets[row]
     end = values.shape[1] - springs.halo
-    return [values[axis, offset : end + offset] - values[axis, :end] for axis in range(3)]
+    return [
+        _subtract(values[axis, offset : end + offset], values[axis, :end], sign)
+        for axis in range(3)
+    ]
+
+
+def _difference_together(
+    springs: Springs, row: int, values: Float[Array, "3 NHH *B"]
+) -> Float[Array, "3 HN *B"]:
+    """`_difference` as one array; see `_subtract`."""
+    if not springs.offsets:
+        return values.at[:, springs.neighbours[row]].get(mode="promise_in_bounds") - values
+    offset = springs.offsets[row]
+    end = values.shape[1] - springs.halo
+    return values[:, offset : end + offset] - values[:, :end]
+
+
+def _subtract(a: Array, b: Array, sign: int) -> Array:
+    """`sign * (a - b)`, for a sign of 1 or -1.
+
+    The same difference in several loops is one that XLA computes once, in a loop of its own, and
+    keeps in memory: slower than to take it again. Differences of opposite sign are not the same.
+    """
+    return a - b if sign > 0 else b - a
 
 
 def _neighbours(springs: Springs, row: int, values: Float[Array, "N *B"]) -> Float[Array, "N *B"]:

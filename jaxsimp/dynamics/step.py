@@ -16,7 +16,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsimp.dynamics.contact import table_contact
 from jaxsimp.dynamics.simulation import Simulation, State
-from jaxsimp.dynamics.springs import over_batch, pull, spring_forces_vjp, spring_tensions
+from jaxsimp.dynamics.springs import (
+    over_batch,
+    pull,
+    spring_forces_vjp,
+    spring_tensions,
+    springs_vjp,
+)
 
 Axes = list[Float[Array, "N *B"]]
 """Something of every particle along x, y and z."""
@@ -42,89 +48,123 @@ class Motion:
 
 def step(simulation: Simulation, packed: Packed, motion: Motion, share: Float[Array, ""]) -> Packed:
     """Forces, velocities, contact, then positions; held particles move by a share of `drive`."""
+    return step_and_free(simulation, packed, motion, share)[0]
+
+
+def step_and_free(
+    simulation: Simulation, packed: Packed, motion: Motion, share: Float[Array, ""]
+) -> tuple[Packed, Axes]:
+    """The state after a step, and the velocities that it would have without contact."""
     position, velocity = packed
     tensions = spring_tensions(simulation.springs, position, velocity)
     forces = pull(simulation.springs, tensions, position)
-    moved = _velocities(simulation, motion, share, forces, *_here(simulation, packed))
+    speed, height = _here(simulation, packed)
+    free = _free(simulation, motion, forces, speed)
+    moved = _constrained(simulation, motion.held, list(motion.drive), share, free, height)
     # Velocities are written in place, row by row: a stack of rows would not be vectorised. Then
     # all positions move, the halo by zero. (To write positions in place, too, costs a fifth of
     # the step: they are also what is read.)
-    for axis in range(3):
-        corner = (axis, simulation.springs.halo) + (0,) * (velocity.ndim - 2)
-        velocity = jax.lax.dynamic_update_slice(velocity, moved[axis][None], corner)
-    return position + simulation.time_step * velocity, velocity
+    velocity = _write_rows(simulation, velocity, moved)
+    return (position + simulation.time_step * velocity, velocity), free
 
 
 def step_vjp(
     simulation: Simulation,
     packed: Packed,
+    free: Axes,
     motion: Motion,
     share: Float[Array, ""],
     packed_bar: tuple[Axes, Axes],
-) -> tuple[Simulation, tuple[Axes, Axes], Float[Array, "3 N *B"]]:
+    of_simulation: bool,
+) -> tuple[Simulation | None, tuple[Axes, Axes], Axes]:
     """Cotangents of the simulation, state and drive for those of the state after a step.
 
-    Without a batch. Cotangents of states have no halo.
+    Args:
+        simulation: the body's physics.
+        packed: the state before the step.
+        free: the velocities without contact, see `step_and_free`.
+        motion: what the pickers do.
+        share: of `motion.drive`.
+        packed_bar: cotangents of the state after the step, without halo.
+        of_simulation: whether cotangents of the simulation are wanted; if so, without a batch.
     """
     dt, springs = simulation.time_step, simulation.springs
     tensions = spring_tensions(springs, *packed)
-    forces = pull(springs, tensions, packed[0])
     position_bar, velocity_bar = packed_bar
     moved_bar = [v + dt * x for x, v in zip(position_bar, velocity_bar, strict=True)]
+    # Only parameters that the velocities depend on: ids have no cotangent.
     names = ("mass", "radius", "drag", "friction", "gravity", "time_step")
     physics: dict[str, Any] = {name: getattr(simulation, name) for name in names}
 
-    def velocities(
-        physics: dict[str, Any],
-        drive: Float[Array, "3 N"],
-        forces: Axes,
-        velocity: Axes,
-        height: Float[Array, " N"],
-    ) -> Axes:
+    def constrained(physics: dict[str, Any], drive: Axes, free: Axes, height: Array) -> Axes:
         changed = dataclasses.replace(simulation, **physics)
-        driven = Motion(motion.held, drive)
-        return _velocities(changed, driven, share, forces, velocity, height)
+        return _constrained(changed, motion.held, drive, share, free, height)
 
-    here = _here(simulation, packed)
-    moved, pullback = jax.vjp(velocities, physics, motion.drive, forces, *here)
-    physics_bar, drive_bar, forces_bar, velocity_bar, height_bar = pullback(moved_bar)
-    physics_bar["time_step"] += sum(map(jnp.vdot, position_bar, moved))
-    force_bar = packed[0]  # Any halo will do: the springs into it have no stiffness.
-    for axis, row in enumerate(forces_bar):
-        force_bar = jax.lax.dynamic_update_slice(force_bar, row[None], (axis, springs.halo))
-    springs_bar, by_position, by_velocity = spring_forces_vjp(springs, tensions, *packed, force_bar)
+    def unconstrained(physics: dict[str, Any], forces: Axes, velocity: Axes) -> Axes:
+        return _free(dataclasses.replace(simulation, **physics), motion, forces, velocity)
+
+    speed, height = _here(simulation, packed)
+    moved, pullback = jax.vjp(constrained, physics, list(motion.drive), free, height)
+    physics_bar, drive_bar, free_bar, height_bar = pullback(moved_bar)
+    # Linear in forces: what they are matters to cotangents of the physics alone.
+    forces = pull(springs, tensions, packed[0]) if of_simulation else speed
+    _, pullback = jax.vjp(unconstrained, physics, forces, speed)
+    more_bar, forces_bar, speed_bar = pullback(free_bar)
+    # Any halo will do: the springs into it have no stiffness.
+    force_bar = _write_rows(simulation, packed[0], forces_bar)
+    by_position, by_velocity = spring_forces_vjp(springs, tensions, *packed, force_bar)
     by_position[2] += height_bar
-    rest_bar = jnp.zeros_like(simulation.rest)  # Only pickers look at it.
-    simulation_bar = Simulation(springs=springs_bar, rest=rest_bar, **physics_bar)
+    simulation_bar = None
+    if of_simulation:
+        physics_bar = jax.tree.map(jnp.add, physics_bar, more_bar)
+        physics_bar["time_step"] += sum(map(jnp.vdot, position_bar, moved))
+        springs_bar = springs_vjp(springs, tensions, *packed, force_bar)
+        rest_bar = jnp.zeros_like(simulation.rest)  # Only pickers look at it.
+        simulation_bar = Simulation(springs=springs_bar, rest=rest_bar, **physics_bar)
     packed_bar = (
         [a + b for a, b in zip(position_bar, by_position, strict=True)],
-        [a + b for a, b in zip(velocity_bar, by_velocity, strict=True)],
+        [a + b for a, b in zip(speed_bar, by_velocity, strict=True)],
     )
     return simulation_bar, packed_bar, drive_bar
 
 
-def _velocities(
-    simulation: Simulation,
-    motion: Motion,
-    share: Float[Array, ""],
-    forces: Axes,
-    velocity: Axes,
-    height: Float[Array, "N *B"],
-) -> Axes:
-    """Velocities after forces, contact and pickers, particle by particle."""
+def _free(simulation: Simulation, motion: Motion, forces: Axes, velocity: Axes) -> Axes:
+    """Velocities after forces, particle by particle."""
     dt = simulation.time_step
     # Held particles are not free: any mass will do. (With a batch, it makes the mass an array as
     # large as the batch; a division by anything smaller becomes a product with its inverse.)
-    mass = jnp.where(motion.held, 1.0, over_batch(simulation.mass, height))
+    mass = jnp.where(motion.held, 1.0, over_batch(simulation.mass, forces[0]))
     kept = 1.0 - dt * simulation.drag
     gravity = (0.0, 0.0, simulation.gravity)
     # As momentum over mass, for the division.
-    free = [
+    return [
         (mass * (kept * velocity[axis] - dt * gravity[axis]) + dt * forces[axis]) / mass
         for axis in range(3)
     ]
-    moved = table_contact(height - simulation.radius, free, simulation.friction, dt)
-    return [jnp.where(motion.held, motion.drive[axis] * share, moved[axis]) for axis in range(3)]
+
+
+def _constrained(
+    simulation: Simulation,
+    held: Bool[Array, "N *B"],
+    drive: Axes,
+    share: Float[Array, ""],
+    free: Axes,
+    height: Float[Array, "N *B"],
+) -> Axes:
+    """Velocities after contact and pickers."""
+    above = height - simulation.radius
+    moved = table_contact(above, free, simulation.friction, simulation.time_step)
+    return [jnp.where(held, drive[axis] * share, moved[axis]) for axis in range(3)]
+
+
+def _write_rows(
+    simulation: Simulation, array: Float[Array, "3 NHH *B"], rows: Axes
+) -> Float[Array, "3 NHH *B"]:
+    """The array with these rows, but for its halo."""
+    for axis, row in enumerate(rows):
+        corner = (axis, simulation.springs.halo) + (0,) * (row.ndim - 1)
+        array = jax.lax.dynamic_update_slice(array, row[None], corner)
+    return array
 
 
 def _here(simulation: Simulation, packed: Packed) -> tuple[Axes, Float[Array, "N *B"]]:

@@ -14,8 +14,9 @@ import numpy as np
 from jax.tree_util import PyTreeDef
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsimp.dynamics.batching import batch_last
 from jaxsimp.dynamics.simulation import Simulation
-from jaxsimp.dynamics.step import Axes, Motion, Packed, step, step_vjp
+from jaxsimp.dynamics.step import Axes, Motion, Packed, step, step_and_free, step_vjp
 
 
 def plain_steps(
@@ -47,34 +48,19 @@ def _steps(
     drive: Float[Array, "3 N *B"],
     shares: Float[Array, " S"],
 ) -> Packed:
-    @jax.custom_batching.custom_vmap
-    def run(
-        leaves: list[Any], packed: Any, held: Any, drive: Any, shares: Float[Array, " S"]
-    ) -> Packed:
-        return plain_steps(_simulation(tree, leaves), packed, Motion(held, drive), shares)
+    def run(shared: Shared, own: tuple[Any, ...]) -> Packed:
+        leaves, shares = shared
+        packed, *motion = own
+        return plain_steps(_simulation(tree, leaves), packed, Motion(*motion), shares)
 
-    @run.def_vmap
-    def over_batch(
-        size: int, batched: Any, leaves: list[Any], *arguments: Any
-    ) -> tuple[Any, tuple[bool, bool]]:
-        """The batch last, where it is of states and motions alone."""
-        if any(batched[0]) or batched[-1]:
-            axes = jax.tree.map(lambda each: 0 if each else None, batched)
-            return jax.vmap(run.fun, axes)(leaves, *arguments), (True, True)
-        *states, shares = arguments
-
-        def last(array: Array, has_batch: bool) -> Array:
-            array = array if has_batch else jnp.broadcast_to(array[None], (size, *array.shape))
-            return jnp.moveaxis(array, 0, -1)
-
-        states = jax.tree.map(last, states, list(batched[1:-1]))
-        moved = run.fun(leaves, *states, shares)
-        return jax.tree.map(lambda array: jnp.moveaxis(array, -1, 0), moved), (True, True)
-
-    return run(leaves, packed, held, drive, shares)
+    return batch_last(run)((leaves, shares), (packed, held, drive))
 
 
-Kept = tuple[list[Any], Any, Any, Any, list[Any] | None]
+Shared = tuple[list[Any], Float[Array, " S"]]
+"""Leaves of the simulation, and the shares: what is the same for all samples of a batch."""
+Starts = tuple[Float[Array, "segments 3 NHH *B"], Float[Array, "segments 3 NHH *B"]]
+"""States that segments of the steps start from."""
+Kept = tuple[Shared, tuple[Any, Any], Starts, list[Any] | None]
 """Arguments, states at the start of segments, and zero cotangents of the simulation, if wanted."""
 
 
@@ -86,20 +72,28 @@ def _forward(tree: PyTreeDef, *arguments: Any) -> tuple[Packed, Kept]:
         arguments,
         is_leaf=lambda leaf: hasattr(leaf, "perturbed"),
     )
-    simulation, motion = _simulation(tree, leaves), Motion(held, drive)
 
-    def segment(packed: Packed, bounds: Int[Array, " 2"]) -> tuple[Packed, Packed]:
-        def one(i: Int[Array, ""], packed: Packed) -> Packed:
-            return step(simulation, packed, motion, shares[i])
+    def run(shared: Shared, own: tuple[Any, ...]) -> tuple[Packed, Starts]:
+        (leaves, shares), (packed, *motion) = shared, own
+        simulation = _simulation(tree, leaves)
 
-        return jax.lax.fori_loop(bounds[0], bounds[1], one, packed), packed
+        def segment(packed: Packed, bounds: Int[Array, " 2"]) -> tuple[Packed, Packed]:
+            def one(i: Int[Array, ""], packed: Packed) -> Packed:
+                return step(simulation, packed, Motion(*motion), shares[i])
 
-    packed, starts = jax.lax.scan(segment, packed, jnp.asarray(_segments(len(shares))))
+            return jax.lax.fori_loop(bounds[0], bounds[1], one, packed), packed
+
+        return jax.lax.scan(segment, packed, jnp.asarray(_segments(len(shares))))
+
+    shared, motion = (leaves, shares), (held, drive)
+    packed, starts = batch_last(run)(shared, (packed, *motion))
     zeros = jax.tree.map(jnp.zeros_like, leaves) if wanted else None
-    return packed, (leaves, motion, shares, starts, zeros)
+    return packed, (shared, motion, starts, zeros)
 
 
-Bars = tuple[Simulation | None, tuple[Axes, Axes], Float[Array, "3 N"]]
+Recorded = tuple[Packed, Axes]
+"""A state, and the velocities without contact after the step from there."""
+Bars = tuple[Simulation | None, tuple[Axes, Axes], Axes]
 """Cotangents of the simulation, if wanted, of the state without halo, and of the drive."""
 
 
@@ -107,7 +101,34 @@ def _backward(
     tree: PyTreeDef, kept: Kept, packed_bar: Any
 ) -> tuple[list[Any] | None, Packed, None, Float[Array, "3 N"], None]:
     """Segment by segment from the last: its steps again, then their adjoints backwards."""
-    leaves, motion, shares, starts, zeros = kept
+    shared, motion, starts, zeros = kept
+    packed_bar = jax.tree.map(_dense, packed_bar, is_leaf=_is_zero)
+
+    def run(shared: Any, own: Any) -> tuple[Any, ...]:
+        (leaves, shares), zeros = shared
+        motion, starts, packed_bar = own
+        return _adjoint_steps(tree, leaves, shares, zeros, Motion(*motion), starts, packed_bar)
+
+    # Cotangents of a simulation belong to one sample each: with them a batch goes first.
+    adjoint = run if zeros else batch_last(run)
+    simulation_bar, packed_bar, drive_bar = adjoint((shared, zeros), (motion, starts, packed_bar))
+    leaves_bar = [
+        leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else None  # ids have no cotangent
+        for leaf in jax.tree.leaves(simulation_bar)
+    ]
+    return leaves_bar or None, packed_bar, None, drive_bar, None
+
+
+def _adjoint_steps(
+    tree: PyTreeDef,
+    leaves: list[Any],
+    shares: Float[Array, " S"],
+    zeros: list[Any] | None,
+    motion: Motion,
+    starts: Starts,
+    packed_bar: Packed,
+) -> tuple[Simulation | None, Packed, Float[Array, "3 N *B"]]:
+    """Cotangents of the simulation, if `zeros` are given, of the first state, and of the drive."""
     simulation = _simulation(tree, leaves)
     simulation_bar = None if zeros is None else _simulation(tree, zeros)
     segments = _segments(len(shares))
@@ -118,11 +139,12 @@ def _backward(
     def segment(bars: Bars, saved: tuple[Int[Array, " 2"], Packed]) -> tuple[Bars, None]:
         (first, end), packed = saved
 
-        def record(packed: Packed, share: Float[Array, ""]) -> tuple[Packed, Packed]:
-            return step(simulation, packed, motion, share), packed
+        def record(packed: Packed, share: Float[Array, ""]) -> tuple[Packed, Recorded]:
+            after, free = step_and_free(simulation, packed, motion, share)
+            return after, (packed, free)
 
         again = jax.lax.dynamic_slice_in_dim(padded, first, length)
-        _, states = jax.lax.scan(record, packed, again)
+        _, (states, free) = jax.lax.scan(record, packed, again)
 
         def state_at(i: Int[Array, ""]) -> Packed:
             return jax.tree.map(lambda array: array[jnp.maximum(i - first, 0)], states)
@@ -131,33 +153,36 @@ def _backward(
             (simulation_bar, packed_bar, drive_bar), packed = carry
             i = end - 1 - k
             more, packed_bar, drive_more = step_vjp(
-                simulation, packed, motion, shares[i], packed_bar
+                simulation,
+                packed,
+                [axis[i - first] for axis in free],
+                motion,
+                shares[i],
+                packed_bar,
+                simulation_bar is not None,
             )
             if simulation_bar is not None:
                 simulation_bar = jax.tree.map(jnp.add, simulation_bar, more)
             # The state of the next turn is carried: XLA would look it up in `states` anew for
             # each of its uses, element by element.
-            return (simulation_bar, packed_bar, drive_bar + drive_more), state_at(i - 1)
+            drive_bar = [a + b for a, b in zip(drive_bar, drive_more, strict=True)]
+            return (simulation_bar, packed_bar, drive_bar), state_at(i - 1)
 
         return jax.lax.fori_loop(0, end - first, back, (bars, state_at(end - 1)))[0], None
 
     position_bar, velocity_bar = (
-        [bar[axis, halo : halo + count] for axis in range(3)]
-        for bar in jax.tree.map(_dense, packed_bar, is_leaf=_is_zero)
+        [bar[axis, halo : halo + count] for axis in range(3)] for bar in packed_bar
     )
-    bars: Bars = simulation_bar, (position_bar, velocity_bar), jnp.zeros_like(motion.drive)
+    drive_bar = [jnp.zeros_like(row) for row in motion.drive]
+    bars: Bars = simulation_bar, (position_bar, velocity_bar), drive_bar
     bars, _ = jax.lax.scan(segment, bars, (jnp.asarray(segments), starts), reverse=True)
     simulation_bar, (position_bar, velocity_bar), drive_bar = bars
-    padding = ((0, 0), (halo, halo))
+    padding = ((0, 0), (halo, halo)) + ((0, 0),) * (motion.held.ndim - 1)
     packed_bar = (
         jnp.pad(jnp.stack(position_bar), padding),
         jnp.pad(jnp.stack(velocity_bar), padding),
     )
-    leaves_bar = [
-        leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else None  # ids have no cotangent
-        for leaf in jax.tree.leaves(simulation_bar)
-    ]
-    return leaves_bar or None, packed_bar, None, drive_bar, None
+    return simulation_bar, packed_bar, jnp.stack(drive_bar)
 
 
 _steps.defvjp(_forward, _backward, symbolic_zeros=True)
