@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from jaxsimp import goals
 from jaxsimp.body import Body, cloth, rope
-from jaxsimp.dynamics import NONE, Actions, State, make_pickers, make_simulation, rollout
+from jaxsimp.dynamics import NONE, Actions, State, make_pickers, make_simulation, rollout, springs
 from jaxsimp.dynamics.springs import make_springs, pull, spring_tensions
 
 ROPE = rope(8, 0.2)
@@ -106,20 +106,28 @@ def test_reverse_forward_and_differences_agree(body, time_step, picks):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
-def test_vmap_of_the_gradient_is_a_loop_over_it():
+@pytest.mark.parametrize("by_neighbour", [False, True], ids=["by offset", "by neighbour"])
+@pytest.mark.parametrize("names", [("displacement", "start"), ("displacement", "stiffness")])
+def test_vmap_of_the_gradient_is_a_loop_over_it(names, by_neighbour, monkeypatch):
+    # Cotangents of motions alone have the batch last, those of a simulation have it first.
+    monkeypatch.setattr(springs, "MOST_OFFSETS", 0 if by_neighbour else springs.MOST_OFFSETS)
     loss, inputs = problem(CHAIN, 1e-3, [0, 4], steps=1)
-    moves = jnp.stack([part * inputs["displacement"] for part in (1.0, 1.3, -0.7)])
+    factors = jnp.array([1.0, 1.3, -0.7])
+    moves = {name: jnp.stack([factor * inputs[name] for factor in factors]) for name in names}
 
-    def one(displacement):
-        return loss(inputs | {"displacement": displacement})[0]
+    def one(changed):
+        return loss(inputs | changed)[0]
 
     together = jax.jit(jax.vmap(jax.grad(one)))(moves)
     alone = jax.jit(jax.grad(one))
-    for move, found in zip(moves, together, strict=True):
-        wanted = alone(move)
-        # Rounding of 2 steps, relative to the largest derivative.
-        np.testing.assert_allclose(found, wanted, atol=1e-11 * float(jnp.abs(wanted).max()))
-    assert np.abs(together[0] - together[1]).max() > 1e-3 * np.abs(together).max()
+    for name in names:
+        for index in range(len(factors)):
+            wanted = alone({other: moves[other][index] for other in names})[name]
+            # Rounding of 2 steps, relative to the largest derivative.
+            atol = 1e-11 * float(jnp.abs(wanted).max())
+            np.testing.assert_allclose(together[name][index], wanted, atol=atol)
+        apart = np.abs(together[name][0] - together[name][1]).max()
+        assert apart > 1e-3 * np.abs(together[name]).max()
 
 
 def awkward_starts(body: Body) -> dict[str, np.ndarray]:
