@@ -46,8 +46,9 @@ class Layout:
             )
 
 
-CHUNK_SIZE = 32
-"""Samples a chunk on a CPU: two vectors of floats, which fill the processor whatever the body."""
+CHUNK_SIZE = 8
+"""Samples a chunk on a CPU, whatever the number of workers: a sample's chunk decides how it rounds,
+so plans do not depend on how many cores or devices there are. Larger chunks are within a fifth."""
 MOST_CHUNKED_PARTICLES = 1000
 """Grids and ropes of more run sample by sample: the states of a chunk would leave the cache."""
 
@@ -65,10 +66,11 @@ def default_layout(population: int, simulation: Simulation) -> Layout:
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         return Layout(chunk_size=-(-population // len(devices)), num_workers=len(devices))
-    workers = max(_num_cores(), len(devices))
     alone = simulation.springs.offsets and len(simulation.mass) > MOST_CHUNKED_PARTICLES
-    share = -(-population // workers)
-    return Layout(chunk_size=1 if alone else min(CHUNK_SIZE, share), num_workers=workers)
+    return Layout(
+        chunk_size=1 if alone else min(CHUNK_SIZE, population),
+        num_workers=max(_num_cores(), len(devices)),
+    )
 
 
 def _num_cores() -> int:

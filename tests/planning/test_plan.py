@@ -82,19 +82,24 @@ def test_a_planner_made_anew_gives_the_same_plan():
 
 IN_A_PROCESS = """
 import dataclasses, sys
+import jax
 import numpy as np
-from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner, save_plan
+from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner
 from jaxsimp.tasks import make_task
+path, population, num_devices, layout = sys.argv[1], *map(int, sys.argv[2:4]), sys.argv[4:]
+jax.config.update("jax_num_cpu_devices", num_devices)
 task = dataclasses.replace(
     make_task("rope_folding", 9),
     num_actions=2, action_seconds=0.05, settle_actions=2,
 )
-config = CEMConfig(num_iterations=2, population=6, initial_populations=1)
-planner = Planner(task, config, Layout(1, 2))
+config = CEMConfig(num_iterations=2, population=population, initial_populations=1)
+planner = Planner(task, config, Layout(*map(int, layout)) if layout else None)
+assert jax.local_device_count() == num_devices
+assert planner.layout.num_workers >= num_devices
 episode = task.episode_fn(3)
 plan = planner.plan(episode, np.array([0, 4, 8]), ENCODINGS["categorical"], 3)
 np.savez(
-    sys.argv[1],
+    path,
     pick=plan.actions.pick,
     displacement=plan.actions.displacement,
     costs=plan.search.best_costs,
@@ -103,18 +108,31 @@ np.savez(
 """
 
 
-def test_another_process_finds_the_same_plan_bit_for_bit(tmp_path):
+def in_another_process(path: Path, *arguments: int) -> dict[str, np.ndarray]:
     root = Path(__file__).parents[2]
-    subprocess.run(
-        [sys.executable, "-c", IN_A_PROCESS, tmp_path / "other.npz"], check=True, cwd=root
-    )
+    command = [sys.executable, "-c", IN_A_PROCESS, path, *map(str, arguments)]
+    subprocess.run(command, check=True, cwd=root)
+    with np.load(path) as found:
+        return dict(found)
+
+
+def test_another_process_finds_the_same_plan_bit_for_bit(tmp_path):
+    other = in_another_process(tmp_path / "other.npz", 6, 1, 1, 2)
     plan = planned(3)
     execution = planner().execute(small_task().episode_fn(3), plan.actions)
-    with np.load(tmp_path / "other.npz") as other:
-        np.testing.assert_array_equal(other["pick"], plan.actions.pick)
-        np.testing.assert_array_equal(other["displacement"], plan.actions.displacement)
-        np.testing.assert_array_equal(other["costs"], plan.search.best_costs)
-        np.testing.assert_array_equal(other["positions"], execution.positions)
+    np.testing.assert_array_equal(other["pick"], plan.actions.pick)
+    np.testing.assert_array_equal(other["displacement"], plan.actions.displacement)
+    np.testing.assert_array_equal(other["costs"], plan.search.best_costs)
+    np.testing.assert_array_equal(other["positions"], execution.positions)
+
+
+@pytest.mark.parametrize("num_devices", [2, 4, 8])
+def test_any_number_of_devices_finds_the_same_plan_bit_for_bit(num_devices, tmp_path):
+    # By the default layout: each of the devices has a share of 64 plans.
+    one = in_another_process(tmp_path / "one.npz", 64, 1)
+    more = in_another_process(tmp_path / "more.npz", 64, num_devices)
+    for name, array in one.items():
+        np.testing.assert_array_equal(more[name], array)
 
 
 @pytest.mark.parametrize("layout", [Layout(3, 1), Layout(2, 3)], ids=str)

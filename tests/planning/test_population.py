@@ -132,8 +132,7 @@ def test_a_layout_needs_at_least_one_of_each(chunk_size, num_workers):
 
 @pytest.mark.parametrize("population", [1, 2, 128, 333])
 @pytest.mark.parametrize("body", [rope(9), cloth((40, 40))], ids=["rope", "large cloth"])
-def test_the_default_layout_has_chunks_no_larger_than_a_share(population, body):
+def test_default_chunks_depend_on_the_body_alone(population, body):
     layout = default_layout(population, make_simulation(body, 1e-4))
-    share = -(-population // layout.num_workers)
-    assert 1 <= layout.chunk_size <= share
-    assert layout.chunk_size == 1 or body.num_particles < 1000
+    assert layout.chunk_size == (1 if body.num_particles > 1000 else min(8, population))
+    assert layout.num_workers >= jax.local_device_count()
