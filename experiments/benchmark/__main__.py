@@ -19,6 +19,7 @@ SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
     "step": rollouts.step,
     "rollout": rollouts.rollout,
     "population": rollouts.population,
+    "storage": rollouts.storage,
     "engines": rollouts.engines,
     "gradient": rollouts.gradient,
     "cem": planning.cem,

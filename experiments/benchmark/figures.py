@@ -53,19 +53,23 @@ def plot_engines(rows: Rows) -> "Figure":
 
 
 def plot_layouts(rows: Rows) -> "Figure":
-    """Speed by chunk size, a line for each number of workers."""
+    """Speed by chunk size, a panel for each body, a line for each number of workers."""
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-    for color, workers in zip(COLORS, sorted({row["workers"] for row in rows}), strict=False):
-        of_these = [row for row in rows if row["workers"] == workers]
-        speeds = {row["chunk_size"]: _speed(row) for row in of_these}
-        label = f"{workers} worker{'s' if workers > 1 else ''}"
-        axes.plot(*zip(*sorted(speeds.items()), strict=True), "o-", color=color, label=label)
-    axes.set_xscale("log", base=2)
-    axes.set(xlabel="samples in a chunk", ylabel="million particle-steps per second")
-    axes.set(title=_title(rows), ylim=(0, None))
-    axes.legend(frameon=False)
+    bodies = list(dict.fromkeys(row["body"] for row in rows))
+    figure, panels = plt.subplots(
+        1, len(bodies), figsize=(3.6 * len(bodies), 3.4), squeeze=False, layout="constrained"
+    )
+    for axes, body in zip(panels[0], bodies, strict=True):
+        of_body = [row for row in rows if row["body"] == body]
+        for color, workers in zip(COLORS, sorted({row["workers"] for row in rows}), strict=False):
+            speeds = {r["chunk_size"]: _speed(r) for r in of_body if r["workers"] == workers}
+            label = f"{workers} worker{'s' if workers > 1 else ''}"
+            axes.plot(*zip(*sorted(speeds.items()), strict=True), "o-", color=color, label=label)
+        axes.set_xscale("log", base=2)
+        axes.set(xlabel="samples in a chunk", title=_title(of_body), ylim=(0, None))
+    panels[0][0].set_ylabel("million particle-steps per second")
+    panels[0][0].legend(frameon=False)
     return figure
 
 
@@ -90,4 +94,6 @@ def _speed(row: Row) -> float:
 
 
 def _title(rows: Rows) -> str:
-    return f"{rows[0]['body'].replace('_', ' of ')} a side, {rows[0]['population']} rollouts"
+    kind, side = rows[0]["body"].split("_")
+    size = f"{side} particles" if kind == "rope" else f"{side} × {side}"
+    return f"{kind}, {size}, {rows[0]['population']} rollouts"

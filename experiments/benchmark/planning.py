@@ -24,10 +24,10 @@ from experiments.benchmark.measure import (
 )
 from experiments.engines.workload import num_cores
 from jaxsimp.body import rope
-from jaxsimp.planning import ENCODINGS, CEMConfig, Planner
+from jaxsimp.planning import ENCODINGS, CEMConfig, Plan, Planner
 from jaxsimp.simplify import qp, simplify
 from jaxsimp.simplify.rope_uniform import fit_rope, fit_rope_constrained, interpolation_matrix
-from jaxsimp.tasks import Task, make_task
+from jaxsimp.tasks import make_task
 
 PLANNED_STEPS = (4, 150)
 """Actions of a planned rollout, the last one with nothing held, and time steps of each."""
@@ -37,27 +37,21 @@ LINE_SIZE = 6
 
 def cem(scale: Scale) -> Iterator[Row]:
     """An iteration of CEM, and a whole plan of a diagonal fold, with the share of cores busy."""
-    task = fold(scale.cem_side)
-    config = CEMConfig(scale.cem_iterations, scale.population, initial_populations=1)
     start = time.perf_counter()
-    planner = Planner(task, config)
+    planner = fold_planner(scale.cem_side, scale.population, scale.cem_iterations)
     compiling = time.perf_counter() - start
-    candidates = simplify(task.body, task.goal).particles
-    episode, encoding = task.episode_fn(0), ENCODINGS["categorical"]
+    task, config = planner.task, planner.config
     marks: list[tuple[float, float]] = []
 
     def mark() -> None:
         marks.append((time.perf_counter(), time.process_time()))
 
-    def run() -> Any:
-        return planner.plan(episode, candidates, encoding, seed=0, on_population=mark)
-
-    ready = prepare(lambda: run)
+    ready = prepare(lambda: lambda: plan_fold(planner, mark))
     compiling += ready.result.compile_seconds
     seconds, iterations, busy = [], [], []
     for _ in range(scale.cem_plans):
         marks.clear()
-        seconds.append(run().seconds)
+        seconds.append(ready.run().seconds)
         wall, processor = np.diff(marks, axis=0).T
         iterations.extend(wall)
         busy.append(processor.sum() / wall.sum() / num_cores())
@@ -71,7 +65,7 @@ def cem(scale: Scale) -> Iterator[Row]:
         "layout": "default layout",
         "cpu_share": float(np.median(busy)),
     }
-    score = planner.execute(episode, ready.result.actions).score
+    score = planner.execute(task.episode_fn(0), ready.result.actions).score
     rounds = config.num_populations
     yield make_row("cem_iteration", **fields) | measured(ready, np.array(iterations), work)
     yield make_row("cem_plan", **fields, rollouts=rounds * config.population, score=score) | (
@@ -79,11 +73,20 @@ def cem(scale: Scale) -> Iterator[Row]:
     )
 
 
-def fold(side: int) -> Task:
-    """The diagonal fold, with rollouts of `PLANNED_STEPS`."""
+def fold_planner(side: int, population: int, num_iterations: int) -> Planner:
+    """A planner of the diagonal fold, with rollouts of `PLANNED_STEPS`."""
     task = make_task("cloth_diagonal_folding", side)
     actions, steps = PLANNED_STEPS
-    return dataclasses.replace(task, num_actions=actions - 1, action_seconds=steps * task.time_step)
+    task = dataclasses.replace(task, num_actions=actions - 1, action_seconds=steps * task.time_step)
+    return Planner(task, CEMConfig(num_iterations, population, initial_populations=1))
+
+
+def plan_fold(planner: Planner, on_population: Callable[[], None] = lambda: None) -> Plan:
+    """Key points of the fold's goal, and a plan over them."""
+    task = planner.task
+    candidates = simplify(task.body, task.goal).particles
+    encoding = ENCODINGS["categorical"]
+    return planner.plan(task.episode_fn(0), candidates, encoding, 0, on_population)
 
 
 def line_fit(scale: Scale) -> Iterator[Row]:
@@ -142,21 +145,20 @@ import jaxsimp
 imported = time.perf_counter()
 import jaxsimp.planning
 planning = time.perf_counter()
-from experiments.benchmark.planning import fold
-from jaxsimp.planning import CEMConfig, Planner
-planner = Planner(fold(int(sys.argv[1])), CEMConfig(population=int(sys.argv[2])))
-planner.estimate_seconds()
+from experiments.benchmark.planning import fold_planner, plan_fold
+planner = fold_planner(*map(int, sys.argv[1:]))
+plan = plan_fold(planner)
 print(json.dumps({
     "jaxsimp": imported - start,
     "jaxsimp.planning": planning - start,
-    "compile": planner.compile_seconds,
+    "compile": planner.compile_seconds + plan.compile_seconds,
     "all": time.perf_counter() - start,
 }))
 """
 
 
 def cold_start(scale: Scale) -> Iterator[Row]:
-    """New processes: the import, and all that passes until a population was rolled out once."""
+    """New processes: the import, and all that passes until a plan is found."""
     found: dict[str, list[dict[str, float]]] = {}
     for _ in range(scale.cold_starts):
         with tempfile.TemporaryDirectory() as folder:
@@ -173,9 +175,10 @@ def cold_start(scale: Scale) -> Iterator[Row]:
         )
     for cache, all_times in found.items():
         yield make_row(
-            "cold_start_population",
+            "cold_start_plan",
             **fields,
             population=scale.population,
+            rollouts=scale.cem_iterations * scale.population,
             layout=cache,
             compile_seconds=float(np.median([times["compile"] for times in all_times])),
             run_seconds=float(np.median([times["all"] for times in all_times])),
@@ -183,7 +186,8 @@ def cold_start(scale: Scale) -> Iterator[Row]:
 
 
 def _start_cold(scale: Scale, cache: str | None) -> dict[str, float]:
-    """Seconds of a new process that compiles a planner."""
+    """Seconds of a new process that compiles and plans."""
+    sizes = scale.cem_side, scale.population, scale.cem_iterations
     enabled = "false" if cache is None else "true"
     environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": enabled}
     if cache is not None:
@@ -193,7 +197,7 @@ def _start_cold(scale: Scale, cache: str | None) -> dict[str, float]:
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         }
     done = subprocess.run(
-        [sys.executable, "-c", COLD_START, str(scale.cem_side), str(scale.population)],
+        [sys.executable, "-c", COLD_START, *map(str, sizes)],
         cwd=Path(__file__).parents[2],
         env=environment,
         capture_output=True,

@@ -80,26 +80,51 @@ def _one_sample(
 
 
 def population(scale: Scale) -> Iterator[Row]:
-    """A population in every layout; errors are differences from jaxsimp's own choice."""
-    workload = _cloth(scale)
-    total = workload.population
-    workers = sorted({1, num_cores()})
-    layouts = [
-        Layout(chunk, count)
-        for count in workers
-        for chunk in scale.chunk_sizes
-        if chunk <= total // count
+    """A population of each kind of body in every layout; errors: differences from the default."""
+    for kind in KINDS:
+        side = scale.rope if kind == "rope" else scale.side
+        yield from _layouts(kind, side, scale)
+
+
+def storage(scale: Scale) -> Iterator[Row]:
+    """A population of the cloth, and of the same cloth as springs in no order, in turns."""
+    kinds = ("cloth", "unstructured")
+    workloads = [
+        make_workload(
+            make_body(kind, scale.side), scale.population, scale.num_actions, scale.action_steps
+        )
+        for kind in kinds
     ]
-    layouts = list(
-        dict.fromkeys([default_layout(total, physics(workload)[0]), *layouts, Layout(total, 1)])
+    ready = [prepare(partial(population_map.prepare, workload)) for workload in workloads]
+    times = time_in_turns([each.run for each in ready], scale.repeats)
+    for index, kind in enumerate(kinds):
+        yield make_row(
+            "population_storage",
+            engine="jaxsimp",
+            body=f"{kind}_{scale.side}",
+            population=scale.population,
+            layout="default layout",
+            speed_over_grid=float(np.median(times[:, 0] / times[:, index])),
+        ) | measured(ready[index], times[:, index], workloads[index].particle_steps)
+
+
+def _layouts(kind: str, side: int, scale: Scale) -> Iterator[Row]:
+    workload = make_workload(
+        make_body(kind, side), scale.population, scale.num_actions, scale.action_steps
     )
+    total = workload.population
+    layouts = [default_layout(total, physics(workload)[0]), Layout(total, 1)]
+    for workers in sorted({1, num_cores()}):
+        chunks = (chunk for chunk in scale.chunk_sizes if chunk <= total // workers)
+        layouts.extend(Layout(chunk, workers) for chunk in chunks)
+    layouts = list(dict.fromkeys(layouts))
     ready = [prepare(partial(population_map.prepare, workload, layout)) for layout in layouts]
     times = time_in_turns([each.run for each in ready], scale.repeats)
     for layout, each, seconds in zip(layouts, ready, times.T, strict=True):
         yield make_row(
             "population_layout",
             engine="jaxsimp",
-            body=f"cloth_{scale.side}",
+            body=f"{kind}_{side}",
             population=total,
             layout=describe(layout) + (", default" if layout is layouts[0] else ""),
             chunk_size=layout.chunk_size,
