@@ -274,7 +274,7 @@ def test_wrong_requests_are_refused_before_anything_runs(tmp_path, monkeypatch, 
     (tmp_path / "file").write_text("mine")
     monkeypatch.setattr(command, "run", lambda *_: pytest.fail("it ran"))
     for options, message in [
-        (only("speed"), "unknown section 'speed'; choose from step, rollout, population, engines"),
+        (only("speed"), "unknown section 'speed'; choose from step, rollout, population, storage"),
         (("--json", tmp_path / "none" / "rows.json"), "is no folder"),
         (("--json", tmp_path), "is a folder; give a file"),
         (("--figures", tmp_path / "file"), "is a file; give a folder"),
