@@ -75,8 +75,9 @@ def t_shirt(
     """A T-shirt for a child: 0.5 m long, 0.6 m from cuff to cuff.
 
     Shoulders and sleeves are one straight line that falls from the neck; cuffs are at right
-    angles to it. Landmarks: `neck` (its lowest point), `left_collar` (neck and shoulder meet),
-    `left_cuff_top`, `left_cuff_bottom`, `left_armpit`, `left_hem`, the same right, and `middle_hem`.
+    angles to it. Landmarks: `neck` (its lowest point), `left_collar` (where neck and shoulder
+    meet), `left_shoulder` (above the armpit), `left_cuff_top`, `left_cuff_bottom`,
+    `left_armpit`, `left_hem`, the same right, and `middle_hem`.
 
     Args:
         length: along y, from the collar to the hem, metres.
@@ -111,10 +112,13 @@ def t_shirt(
     armpit = shoulder - [0.0, sleeve_width / cos]
     _require_less("the depth of the armpits", -armpit[1], "the length", length)
     _require_less("neck_depth", neck_depth, "the length", length)
-    _require_less("sleeve_width tan(slope)", sleeve_width * sin / cos, "sleeve_length", sleeve_length)
+    _require_less(
+        "sleeve_width tan(slope)", sleeve_width * sin / cos, "sleeve_length", sleeve_length
+    )
     half = {
         "neck": (0.0, -neck_depth),
         "collar": (neck_width / 2, 0.0),
+        "shoulder": tuple(shoulder),
         "cuff_top": tuple(cuff_top),
         "cuff_bottom": tuple(cuff_bottom),
         "armpit": tuple(armpit),
@@ -173,8 +177,9 @@ def skirt(
     num_particles: int = 600,
     **options: Any,
 ) -> Garment:
-    """A skirt. Landmarks: `left_waist`, `left_hem`, the same right, `middle_waist` and
-    `middle_hem`.
+    """A skirt, wider at its hem.
+
+    Landmarks: `left_waist`, `left_hem`, the same right, `middle_waist` and `middle_hem`.
 
     Args:
         length: along y, metres.

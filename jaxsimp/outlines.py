@@ -237,7 +237,7 @@ def _means_of_neighbours(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _laid_flat(points: np.ndarray) -> np.ndarray:
-    """x and y of a flat mesh turned, by the least angle, to be horizontal."""
+    """A flat mesh turned by the least angle to be horizontal, shape (V, 2)."""
     centred = points - points.mean(axis=0)
     normal = np.linalg.svd(centred, full_matrices=False)[2][2]
     height, extent = np.ptp(centred @ normal), np.ptp(points, axis=0).max()
