@@ -13,6 +13,8 @@ from jaxtyping import Float, Int
 
 Points = Float[np.ndarray, "V 3"]
 Faces = Int[np.ndarray, "F 3"]
+Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
+"""Points and triangles of a mesh that a function makes."""
 
 WELD = 1e-5
 """Points closer than this, relative to the largest extent, are one point; a triangle that is
@@ -22,7 +24,7 @@ SMALLEST, LARGEST = 0.02, 5.0
 UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254))
 
 
-def load_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[Points, Faces]:
+def load_mesh(path: str | Path, *, scale: float = 1.0) -> Mesh:
     """A clean mesh from a file: `read_mesh`, then `clean_mesh`.
 
     Args:
@@ -39,7 +41,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> tuple[Points, Faces]:
         raise ValueError(f"{path}: {error}") from error
 
 
-def read_mesh(path: str | Path) -> tuple[Points, Faces]:
+def read_mesh(path: str | Path) -> Mesh:
     """Points and triangles as a file has them: in its order and unit, unwelded, unchecked.
 
     Polygons are cut into triangles, and the parts of a scene are put together. Axes are taken
@@ -61,6 +63,8 @@ def read_mesh(path: str | Path) -> tuple[Points, Faces]:
             mesh = trimesh.load_mesh(Path(path), process=False, **options)
             points = np.array(mesh.vertices, dtype=float)
             faces = np.array(mesh.faces, dtype=np.int64)
+        if faces.size:
+            _check_shapes(points, faces)
     except Exception as error:  # the readers raise whatever a broken file makes of them
         raise ValueError(
             f"{path} cannot be read as a mesh ({type(error).__name__}: {error}); "
@@ -71,7 +75,7 @@ def read_mesh(path: str | Path) -> tuple[Points, Faces]:
     return points, faces
 
 
-def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> tuple[Points, Faces]:
+def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
     """One orientable surface in metres, from a mesh that may be dirty.
 
     Mended: points that coincide (see `WELD`) become the first of them; triangles that are
@@ -91,9 +95,7 @@ def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> tuple[Poi
     """
     if not 0 < scale < np.inf:
         raise ValueError(f"scale is {scale}; give the metres in one unit of the mesh")
-    for name, array in (("points", points), ("faces", faces)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name} has shape {array.shape}; a row of three is needed for each")
+    _check_shapes(points, faces)
     points, faces = _referenced(points, _distinct_ids(points, faces))
     points = scale * points.astype(float)
     _check_coordinates(points)
@@ -170,6 +172,12 @@ def spring_weights(
     joined = set(map(tuple, pairs.tolist()))
     free = np.array([tuple(pair) not in joined for pair in across.tolist()], dtype=bool)
     return (pairs, total / length**2), (across[free], weight[free])
+
+
+def _check_shapes(points: np.ndarray, faces: np.ndarray) -> None:
+    for name, array in (("points", points), ("faces", faces)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError(f"{name} has shape {array.shape}; a row of three is needed for each")
 
 
 def _distinct_ids(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

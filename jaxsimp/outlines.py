@@ -7,7 +7,7 @@ triangulation, and smoothed. Nothing is random.
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.meshes import Faces, Points, boundary_edges, clean_mesh, face_areas, half_edges
+from jaxsimp.meshes import Faces, Mesh, Points, boundary_edges, clean_mesh, face_areas, half_edges
 
 Corners = Float[np.ndarray, "C 2"]
 
@@ -19,7 +19,7 @@ TURN = np.deg2rad(20.0)  # of a boundary, above which a point is a corner
 FLAT = 1e-3  # height of a flat mesh, relative to its extent
 
 
-def mesh_outline(corners: Corners, num_points: int) -> tuple[Points, Faces]:
+def mesh_outline(corners: Corners, num_points: int) -> Mesh:
     """A polygon filled with nearly equilateral triangles, facing up, at z = 0.
 
     The corners are points of the mesh, and come first, in their order. Each side is divided
@@ -76,7 +76,7 @@ def mesh_symmetric_outline(
     )
 
 
-def remesh(points: Points, faces: Faces, num_points: int) -> tuple[Points, Faces]:
+def remesh(points: Points, faces: Faces, num_points: int) -> Mesh:
     """A flat mesh meshed anew, with a wanted number of points, horizontal, facing up.
 
     The outline keeps its corners, where it turns by more than 20 degrees; between them it is
