@@ -122,12 +122,11 @@ def check_outline(corners: Corners) -> Corners:
     if not np.isfinite(corners).all():
         raise ValueError("an outline has a corner that is not finite; give metres")
     size = np.ptp(corners, axis=0).max()
-    if abs(_signed_area(corners)) <= 1e-9 * size**2:
-        raise ValueError("the outline encloses nothing; give corners around an area")
+    twice = np.flatnonzero(_side_lengths(corners) <= 1e-9 * size)
+    if twice.size:
+        raise ValueError(f"corner {twice[0]} is there twice in a row; leave one out")
     starts, ends = corners, np.roll(corners, -1, axis=0)
     for side, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        if np.linalg.norm(end - start) <= 1e-9 * size:
-            raise ValueError(f"corner {side} is there twice in a row; leave one out")
         # Neither the side before nor the one after may come back to this one but at the corner.
         others = np.delete(np.arange(len(corners)), [side - 1, side, (side + 1) % len(corners)])
         far = np.concatenate([corners[others], starts[[side - 1]], ends[[(side + 1) % len(ends)]]])
@@ -137,6 +136,8 @@ def check_outline(corners: Corners) -> Corners:
                 f"the outline crosses or touches itself at the side from "
                 f"{start.round(4).tolist()} to {end.round(4).tolist()}; give a simple outline"
             )
+    if abs(_signed_area(corners)) <= 1e-9 * size**2:
+        raise ValueError("the outline encloses nothing; give corners around an area")
     return corners
 
 
@@ -146,7 +147,7 @@ def _fill(corners: np.ndarray, num_points: int, *, mirrored: bool) -> tuple[np.n
     Their number, counted with the mirror images of those off x = 0 if `mirrored`, is that wanted.
     """
     if num_points < 3:
-        raise ValueError(f"num_points is {num_points}; at least 3 are needed")
+        raise ValueError(f"{num_points} points are asked for; at least 3 are needed")
     images = 2 if mirrored else 1
     area, around = abs(_signed_area(corners)), _side_lengths(corners).sum()
     # A hexagonal lattice has num = 2 area / (sqrt(3) h^2) + around / (2 h) + 1 points.
@@ -163,8 +164,8 @@ def _fill(corners: np.ndarray, num_points: int, *, mirrored: bool) -> tuple[np.n
         spacing *= (count / num_points) ** 0.4  # less than 1/2, which overshoots
     if best is None or miss > COUNT_TOLERANCE * num_points:
         raise ValueError(
-            f"num_points is {num_points}; this outline is met with {found}: ask for that, or for "
-            f"many more"
+            f"{num_points} points are asked for; this outline is met with {found}: ask for that, "
+            f"or for many more"
         )
     return best
 
@@ -250,7 +251,7 @@ def _laid_flat(points: np.ndarray) -> np.ndarray:
     normal = normal * np.sign(leading)  # up, or else along y or x
     axis = np.cross(normal, [0.0, 0.0, 1.0])
     cross = np.cross(np.eye(3), axis)  # of which the rows are e x axis
-    turn = np.eye(3) - cross + cross @ cross / (1 + normal[2])
+    turn = np.eye(3) + cross + cross @ cross / (1 + normal[2])
     return (centred @ turn.T)[:, :2]
 
 
