@@ -336,5 +336,6 @@ def _inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     (x0, y0), (x1, y1) = corners.T, np.roll(corners, -1, axis=0).T
     x, y = points.T[:, :, None]
     crosses = (y0 > y) != (y1 > y)
-    rise = np.where(y1 == y0, 1.0, y1 - y0)  # a level side is crossed by no ray
-    return (crosses & (x < x0 + (y - y0) / rise * (x1 - x0))).sum(axis=1) % 2 == 1
+    # The point is to the left of the crossing, without a division by the side's rise.
+    before = ((y - y0) * (x1 - x0) > (x - x0) * (y1 - y0)) == (y1 > y0)
+    return (crosses & before).sum(axis=1) % 2 == 1
