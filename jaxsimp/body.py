@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsimp.meshes import clean_mesh, face_areas, spring_weights
+
 
 @dataclass(frozen=True, eq=False)
 class Body:
@@ -20,7 +22,8 @@ class Body:
 
     Attributes:
         name: the kind of body, for messages and reports.
-        rest: rest coordinates, shape (N, 3), metres: the unstretched body, flat and centred.
+        rest: rest coordinates, shape (N, 3), metres: the unstretched body, its lowest point at
+            z = 0, centred along x and y. Flat, but for a mesh that is not.
         mass: particle masses, shape (N,), kilograms.
         springs: particle ids of the spring ends, shape (S, 2), no pair twice.
         rest_length: spring lengths at zero force, shape (S,), metres.
@@ -31,8 +34,8 @@ class Body:
         radius: half the thickness, metres: a particle rests on the table at this height.
         drag: rate at which the air slows every particle, per second: dv/dt = -drag v.
         friction: Coulomb coefficient between the body and the table.
-        shape: number of particles along each rest axis, `(N,)` for a rope, `(rows, columns)`
-            for a cloth.
+        shape: number of particles along each axis of a grid, `(rows, columns)` for a cloth;
+            `(N,)` for a body that is none, as a rope or a mesh.
 
     Raises:
         ValueError: if an array has the wrong shape or a value that no body can have, if there
@@ -107,14 +110,53 @@ def rope(
     """
     _require_count("num_particles", num_particles, 2)
     _require_positive("length", length)
-    ids = np.arange(num_particles)
     rest = np.zeros((num_particles, 3))
     rest[:, 0] = np.linspace(-length / 2, length / 2, num_particles)
+    return rope_along(
+        rest,
+        mass=mass,
+        stretch_stiffness=stretch_stiffness,
+        bend_stiffness=bend_stiffness,
+        damping=damping,
+        drag=drag,
+        friction=friction,
+        radius=radius,
+    )
+
+
+def rope_along(
+    points: Float[np.ndarray, "N 3"],
+    *,
+    mass: float = 0.02,
+    stretch_stiffness: float = 150.0,
+    bend_stiffness: float = 3.0,
+    damping: float = 0.02,
+    drag: float = 1.0,
+    friction: float = 0.5,
+    radius: float = 0.004,
+) -> Body:
+    """A rope that is at rest along given points, which need not be evenly spread.
+
+    Args:
+        points: of the particles in order, shape (N, 3), metres; N is at least 2.
+        mass: of the whole rope, kilograms.
+        stretch_stiffness: of a spring between neighbours, newtons per metre.
+        bend_stiffness: of a spring between particles two apart, newtons per metre.
+        damping: of every spring, newton-seconds per metre.
+        drag: air drag, per second.
+        friction: Coulomb coefficient with the table.
+        radius: of the rope, metres.
+
+    Raises:
+        ValueError: if a number is out of its range, or particles joined by a spring coincide.
+    """
+    _require_count("num_particles", len(points), 2)
+    ids = np.arange(len(points))
     stretch = np.stack([ids[:-1], ids[1:]], axis=1)
     bend = np.stack([ids[:-2], ids[2:]], axis=1)
     return _mass_spring(
         "rope",
-        rest,
+        _on_the_table(points),
         [(stretch, stretch_stiffness), (bend, bend_stiffness)],
         np.zeros((0, 3), dtype=np.int64),
         mass=mass,
@@ -122,7 +164,7 @@ def rope(
         radius=radius,
         drag=drag,
         friction=friction,
-        shape=(num_particles,),
+        shape=(len(points),),
     )
 
 
@@ -187,6 +229,74 @@ def cloth(
     )
 
 
+def from_mesh(
+    points: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    *,
+    name: str = "mesh",
+    scale: float = 1.0,
+    density: float = 0.25,
+    stretch_stiffness: float = 4.0,
+    bend_stiffness: float = 0.5,
+    damping: float = 1e-3,
+    drag: float = 3.0,
+    friction: float = 0.5,
+    radius: float = 0.002,
+) -> Body:
+    """A sheet of any shape: particles at the points of a triangle mesh.
+
+    The mesh is cleaned first (see `jaxsimp.meshes.clean_mesh`): particles are its points in
+    their order, without copies and points of no triangle. It is at rest as it is given, its
+    lowest point put at z = 0, centred along x and y. A particle has a third of the mass of
+    each of its triangles.
+
+    Stretch springs lie along the edges, bend springs across each edge of two triangles, from
+    corner to corner. Stiffness and damping are the sheet's, shared out by the weights of
+    `jaxsimp.meshes.spring_weights`, so that in its plane the sheet does not depend to first
+    order on how finely it is meshed. On equilateral triangles its Young's modulus times
+    thickness is the sum of both stiffnesses. Out of the plane only bend springs that shorten
+    resist: that is of higher order, and weaker in a finer mesh, as in `cloth`.
+
+    Very unequal or slender triangles ask for a small time step; `jaxsimp.outlines.remesh`
+    replaces those of a flat mesh.
+
+    Args:
+        points: shape (V, 3), metres over `scale`, z up.
+        faces: point ids of the triangles, shape (F, 3).
+        name: of the kind of body.
+        scale: metres in one unit of `points`: 0.001 for millimetres.
+        density: kilograms per square metre.
+        stretch_stiffness: of the sheet, newtons per metre.
+        bend_stiffness: of the sheet, newtons per metre.
+        damping: of the sheet, newton-seconds per metre.
+        drag: air drag, per second.
+        friction: Coulomb coefficient with the table.
+        radius: half the thickness, metres.
+
+    Raises:
+        ValueError: if the mesh is refused (see `clean_mesh`), or a number is out of its range.
+    """
+    _require_positive("density", density)
+    points, faces = clean_mesh(points, faces, scale=scale)
+    (edges, along), (pairs, across) = spring_weights(points, faces)
+    springs, weight = np.concatenate([edges, pairs]), np.concatenate([along, across])
+    third = np.repeat(face_areas(points, faces) / 3, 3)
+    return Body(
+        name=name,
+        rest=_on_the_table(points),
+        mass=density * np.bincount(faces.ravel(), weights=third),
+        springs=springs,
+        rest_length=np.linalg.norm(points[springs[:, 1]] - points[springs[:, 0]], axis=1),
+        stiffness=np.concatenate([stretch_stiffness * along, bend_stiffness * across]),
+        damping=damping * weight,
+        faces=faces,
+        radius=radius,
+        drag=drag,
+        friction=friction,
+        shape=(len(points),),
+    )
+
+
 def _mass_spring(
     name: str,
     rest: np.ndarray,
@@ -218,6 +328,12 @@ def _mass_spring(
         friction=friction,
         shape=shape,
     )
+
+
+def _on_the_table(points: np.ndarray) -> np.ndarray:
+    """Points moved so that the lowest is at z = 0, and the middle of their extent above it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return points - np.array([*(low + high)[:2] / 2, low[2]])
 
 
 def _pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:

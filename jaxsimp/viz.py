@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.body import Body
+from jaxsimp.meshes import boundary_edges
 from jaxsimp.simplify import KeyPoints
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def plot_executions(
 
 
 def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> None:
-    """Draw a rope as a line, a surface as shaded triangles, into 3-D axes.
+    """Draw a rope as a line, a surface as shaded triangles with its boundary, into 3-D axes.
 
     A body whose motion failed, with positions that are not finite, is left out.
 
@@ -174,17 +175,14 @@ def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> N
             antialiased=False,
             shade=True,
         )
-        for edge in _outline(body):
-            axes.plot(*positions[edge].T, color="black", lw=0.6)
+        from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+        outline = positions[boundary_edges(body.faces)]
+        if len(outline):  # a closed surface has none
+            axes.add_collection3d(Line3DCollection(outline, colors="black", linewidths=0.6))
     else:
         axes.plot(*positions.T, color=color, lw=3, solid_capstyle="round")
         axes.scatter(*positions[[0, -1]].T, color=color, s=25, depthshade=False)
-
-
-def _outline(body: Body) -> list[np.ndarray]:
-    """Particle ids along the four sides of a grid."""
-    grid = np.arange(body.num_particles).reshape(body.shape)
-    return [grid[0], grid[-1], grid[:, 0], grid[:, -1]]
 
 
 def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.25) -> None:

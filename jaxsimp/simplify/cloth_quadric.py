@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.body import Body
-from jaxsimp.goals import Positions, check_goal
+from jaxsimp.goals import Positions, as_goal
 from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
 from jaxsimp.simplify.interpolation import interpolation_weights, model_errors
 from jaxsimp.simplify.keypoints import KeyPoints, smallest_fit
@@ -60,7 +60,7 @@ def simplify_quadric(
             tolerance is not above zero, `max_size` is below 4, or no mesh of up to
             `max_size` key points fits.
     """
-    goal = check_goal(body, goal)
+    goal = as_goal(body, goal)
     tolerance = 0.1 * body.size if tolerance is None else tolerance
     _check_options(body, tolerance, max_size)
     meshes = collapse_sequence(goal, follow_creases(body, goal), max_size)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsimp.body import Body
-from jaxsimp.goals import Positions, check_goal
+from jaxsimp.goals import Positions, as_goal
 from jaxsimp.simplify import qp
 from jaxsimp.simplify.interpolation import model_errors
 from jaxsimp.simplify.keypoints import KeyPoints, smallest_fit
@@ -51,7 +51,7 @@ def simplify_uniform(
             tolerance is not above zero, `max_size` is below 2, the constraints contradict
             each other, or no fit of up to `max_size` key points is close enough.
     """
-    goal = check_goal(body, goal)
+    goal = as_goal(body, goal)
     tolerance = 0.015 * body.size if tolerance is None else tolerance
     _check_options(body, tolerance, max_size)
     lower, upper = _box(body, above_table, workspace)

@@ -1,0 +1,195 @@
+"""Folds: parts of a body turned over about lines, one after another, layer upon layer."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxsimp.body import Body
+from jaxsimp.garments import Garment
+from jaxsimp.goals.shapes import Positions, flat
+from jaxsimp.meshes import boundary_edges
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """A line on the table, and what is turned over about it.
+
+    Attributes:
+        point: x and y of a point on the line, metres.
+        direction: x and y of the line's direction; what lies to its left is turned over.
+        part: which particles may be turned over, shape (N,); all by default.
+    """
+
+    point: Float[np.ndarray, " 2"]
+    direction: Float[np.ndarray, " 2"]
+    part: Bool[np.ndarray, " N"] | None = None
+
+
+def fold_sequence(
+    body: Body, folds: Iterable[Fold], positions: Positions | None = None
+) -> Positions:
+    """One fold after another, shape (N, 3).
+
+    Args:
+        body: the body whose thickness separates the layers.
+        folds: in order.
+        positions: what is folded, shape (N, 3), metres; the body flat by default.
+
+    Raises:
+        ValueError: if a fold is refused (see `fold`).
+    """
+    positions = flat(body) if positions is None else positions
+    for one in folds:
+        positions = fold(body, positions, one.point, one.direction, part=one.part)
+    return positions
+
+
+def fold(
+    body: Body,
+    positions: Positions,
+    point: Float[np.ndarray, " 2"],
+    direction: Float[np.ndarray, " 2"],
+    *,
+    part: Bool[np.ndarray, " N"] | None = None,
+) -> Positions:
+    """Fold about a line: what lies to its left is turned over onto what lies to its right.
+
+    The folded layers lie in reversed order, the lowest a thickness (twice the radius) above the
+    highest particle that they come to cover, or on the table if they cover nothing. Particles
+    on the line form the crease, a radius higher than they were.
+
+    Args:
+        body: the body whose thickness separates the layers.
+        positions: what is folded, shape (N, 3), metres.
+        point: x and y of a point on the line, metres.
+        direction: x and y of the line's direction; its length does not matter.
+        part: which particles may be turned over, shape (N,): a sleeve, the upper layers; all
+            by default.
+
+    Raises:
+        ValueError: if the direction has no length, or the line is not finite.
+    """
+    direction = np.asarray(direction, dtype=float)
+    norm = np.linalg.norm(direction)
+    if not 0 < norm < np.inf:
+        raise ValueError(f"direction is {direction.tolist()}; give a finite vector with a length")
+    point = np.asarray(point, dtype=float)
+    if not np.isfinite(point).all():
+        raise ValueError(f"point is {point.tolist()}; give finite coordinates in metres")
+    left = np.array([-direction[1], direction[0]]) / norm
+    distance = (positions[:, :2] - point) @ left
+    # A particle nearer to the line than rounding can tell is on the crease.
+    side = np.where(np.abs(distance) < 1e-6 * body.size, 0.0, np.sign(distance))
+    moves, creases = side > 0, side == 0
+    if part is not None:
+        moves, creases = moves & part, creases & part
+    if not moves.any():
+        return positions.copy()
+    folded = positions.copy()
+    folded[:, :2] -= np.where(moves, 2 * distance, 0.0)[:, None] * left
+    lowest = _height_covered(body, folded, moves) + body.radius
+    z = positions[:, 2]
+    folded[:, 2] = np.select([moves, creases], [lowest + z[moves].max() - z, z + body.radius], z)
+    return folded
+
+
+def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
+    """Folds of a flat rectangular cloth, its sides along x and y, centred.
+
+    - "side": in half, the side at the lower x onto the other.
+    - "diagonal": in half along the diagonal from the corner of highest x and lowest y.
+    - "quarter": in half along x, then along y.
+    - "letter": in thirds along x, the side at the lower x first, the other one on top.
+    - "four_corners": each corner of a square to the centre.
+
+    Args:
+        body: the cloth.
+        name: of the folds.
+
+    Raises:
+        ValueError: if there is no such name, or the cloth is not square for "four_corners".
+    """
+    x, y = np.ptp(body.rest[:, :2], axis=0) / 2
+    side = _fold_about((0.0, 0.0), (0.0, 1.0))
+    if name == "side":
+        return (side,)
+    if name == "diagonal":
+        return (_fold_about((0.0, 0.0), (-x, y)),)
+    if name == "quarter":
+        return side, _fold_about((0.0, 0.0), (1.0, 0.0))
+    if name == "letter":
+        return _fold_about((-x / 3, 0.0), (0.0, 1.0)), _fold_about((x / 3, 0.0), (0.0, -1.0))
+    if name == "four_corners":
+        if not np.isclose(x, y, rtol=0.01):
+            raise ValueError(
+                f"the {body.name} is {2 * x:.4g} m by {2 * y:.4g} m; only the corners of a "
+                f"square are folded to the centre"
+            )
+        # The corner lies to the left of the line through the middles of its sides.
+        return tuple(
+            _fold_about((a * x / 2, b * y / 2), (b, -a))
+            for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        )
+    raise ValueError(
+        f"fold is {name!r}; choose one of side, diagonal, quarter, letter, four_corners"
+    )
+
+
+def sleeves_in(shirt: Garment) -> tuple[Fold, Fold]:
+    """Both sleeves of a flat T-shirt turned in about the lines of its sides, the left one first.
+
+    Raises:
+        ValueError: if the garment has no sleeves.
+    """
+    left, right = _places(shirt, "left_armpit", "right_armpit")
+    x = shirt.body.rest[:, 0]
+    return (
+        Fold(left, np.array([0.0, 1.0]), part=x <= left[0]),
+        Fold(right, np.array([0.0, -1.0]), part=x >= right[0]),
+    )
+
+
+def leg_over_leg(trousers: Garment) -> tuple[Fold]:
+    """The left leg of flat trousers turned over onto the right one, about the middle line.
+
+    Raises:
+        ValueError: if the garment has no legs.
+    """
+    (crotch,) = _places(trousers, "crotch")
+    return (Fold(crotch, np.array([0.0, 1.0])),)
+
+
+def _height_covered(body: Body, folded: np.ndarray, moves: np.ndarray) -> float:
+    """Height of the top of what the moved particles cover, metres; 0 for the bare table.
+
+    Something is covered if it is within 3/4 of a spacing of a moved particle seen from above:
+    on a square grid no place is farther than 0.71 from a particle. Where the moved part borders
+    on another, as the corners of a cloth folded to its centre do, it does not cover it:
+    particles on a surface's boundary do not count, if others moved.
+    """
+    from scipy.spatial import cKDTree
+
+    inner = moves.copy()
+    inner[np.unique(boundary_edges(body.faces))] = False
+    covering, still = folded[inner if inner.any() else moves], folded[~moves]
+    if not len(still):
+        return 0.0
+    distance, _ = cKDTree(covering[:, :2]).query(still[:, :2])
+    covered = still[distance <= 0.75 * body.spacing, 2]
+    return float(covered.max() + body.radius) if len(covered) else 0.0
+
+
+def _fold_about(point: tuple[float, float], direction: tuple[float, float]) -> Fold:
+    return Fold(np.array(point), np.array(direction))
+
+
+def _places(garment: Garment, *names: str) -> list[np.ndarray]:
+    """Places on the table of landmarks of a garment at rest."""
+    missing = [name for name in names if name not in garment.landmarks]
+    if missing:
+        raise ValueError(
+            f"the {garment.body.name} has no {missing[0]}; it has {', '.join(garment.landmarks)}"
+        )
+    return [garment.body.rest[garment.landmarks[name], :2] for name in names]

@@ -1,0 +1,177 @@
+"""A body flat on the table, and ropes laid along lines, letters and a triangle."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsimp.body import Body
+
+Positions = Float[np.ndarray, "N 3"]
+
+
+def flat(body: Body, angle: float = 0.0) -> Positions:
+    """The body at rest, flat on the table and turned by `angle` about z, shape (N, 3).
+
+    Args:
+        body: any body.
+        angle: rotation about the vertical through the origin, radians.
+    """
+    return turn(body.rest + np.array([0.0, 0.0, body.radius]), angle)
+
+
+def turn(positions: Positions, angle: float) -> Positions:
+    """Positions turned about the vertical through the origin, shape (N, 3).
+
+    Args:
+        positions: shape (N, 3), metres.
+        angle: counter-clockwise seen from above, radians.
+    """
+    cos, sin = np.cos(angle), np.sin(angle)
+    return positions @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def polyline(body: Body, corners: Float[np.ndarray, "M 2"]) -> Positions:
+    """A rope laid along a polyline on the table, shape (N, 3).
+
+    Particles are spread evenly over the length of the polyline, which need not equal the
+    rest length: a shorter line is a slack rope.
+
+    Args:
+        body: a rope.
+        corners: x and y of the corners in order, at least two, metres.
+
+    Raises:
+        ValueError: if the polyline has fewer than two corners or no length.
+    """
+    corners = np.asarray(corners, dtype=float)
+    if corners.ndim != 2 or corners.shape[0] < 2 or corners.shape[1] != 2:
+        raise ValueError(f"corners has shape {corners.shape}; (M, 2) with M of 2 or more is needed")
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    if not 0 < arc[-1] < np.inf:
+        raise ValueError(f"the polyline is {arc[-1]:g} m long; give corners that are apart")
+    along = np.linspace(0.0, arc[-1], body.num_particles)
+    xy = [np.interp(along, arc, corners[:, axis]) for axis in range(2)]
+    return np.stack([*xy, np.full(body.num_particles, body.radius)], axis=1)
+
+
+def straight(body: Body, length: float | None = None) -> Positions:
+    """A straight rope along x, centred, shape (N, 3).
+
+    Args:
+        body: a rope.
+        length: distance of the ends, metres; the rest length by default.
+    """
+    half = (body.size if length is None else length) / 2
+    return polyline(body, np.array([[-half, 0.0], [half, 0.0]]))
+
+
+def letter(body: Body, name: str, slack: float = 0.0) -> Positions:
+    """A rope laid as a letter: "C", "M", "O", "S" or "U", upright along y, centred.
+
+    Bows are arcs of circles. An O is open by 10 degrees at its top.
+
+    Args:
+        body: a rope.
+        name: of the letter.
+        slack: share of the rest length by which the letter is shorter than the rope, below 1.
+
+    Raises:
+        ValueError: if there is no such letter, or the slack is not from 0 to below 1.
+    """
+    if name not in _LETTERS:
+        raise ValueError(f"letter is {name!r}; choose one of {', '.join(_LETTERS)}")
+    return _laid_along(body, _LETTERS[name](), slack)
+
+
+def crossed_triangle(body: Body, slack: float = 0.0, tail: float = 0.5) -> Positions:
+    """A rope laid as an equilateral triangle whose two ends cross at the top and go on.
+
+    Args:
+        body: a rope.
+        slack: share of the rest length by which the line is shorter than the rope, below 1.
+        tail: length of an end beyond the crossing, over the side of the triangle.
+
+    Raises:
+        ValueError: if the slack is not from 0 to below 1, or the tail not above zero.
+    """
+    if not 0 < tail < np.inf:
+        raise ValueError(f"tail is {tail:g}; give a length above zero, over the triangle's side")
+    left, right, top = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, np.sqrt(3) / 2]])
+    ends = [top + tail * (top - corner) for corner in (right, left)]
+    line = np.stack([ends[0], right, left, ends[1]])
+    return lift_crossings(body, _laid_along(body, line, slack))
+
+
+def lift_crossings(body: Body, positions: Positions) -> Positions:
+    """A rope on the table, its later particles lifted over earlier ones where it crosses itself.
+
+    At the crossing the upper part is a thickness (twice the radius) above the lower; it comes
+    down to its own height within two spacings of particles on either side.
+
+    Args:
+        body: a rope.
+        positions: shape (N, 3), metres.
+    """
+    lifted = positions.copy()
+    index = np.arange(len(positions))
+    steps = np.diff(positions[:, :2], axis=0)
+    for second in range(2, len(steps)):
+        away = positions[second, :2] - positions[: second - 1, :2]
+        first_step, second_step = steps[: second - 1], steps[second]
+        # Shares of both steps at which their lines cross; parallel ones do not.
+        area = _cross_product(first_step, second_step)
+        safe = np.where(area == 0, np.inf, area)
+        on_first = _cross_product(away, second_step) / safe
+        on_second = _cross_product(away, first_step) / safe
+        crosses = (
+            (area != 0) & (on_first >= 0) & (on_first < 1) & (on_second >= 0) & (on_second < 1)
+        )
+        for first in np.flatnonzero(crosses):
+            share = on_first[first]
+            below = (1 - share) * lifted[first, 2] + share * lifted[first + 1, 2]
+            # Full height at the ends of the upper step, none three particles away.
+            apart = np.abs(index - second - on_second[first])
+            weight = np.clip((3 - apart) / 2, 0.0, 1.0)
+            height = positions[:, 2] + weight * (below + 2 * body.radius - positions[:, 2])
+            later = index > first + 1
+            lifted[later, 2] = np.maximum(lifted[later, 2], height[later])
+    return lifted
+
+
+def _laid_along(body: Body, line: np.ndarray, slack: float) -> Positions:
+    """A rope along a line of any size, scaled to the rope's length and centred."""
+    if not 0 <= slack < 1:
+        raise ValueError(f"slack is {slack:g}; give a share of the rest length, from 0 to below 1")
+    length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+    # The neighbours' rest lengths: a rope at rest need not be straight.
+    rest_length = np.linalg.norm(np.diff(body.rest, axis=0), axis=1).sum()
+    middle = (line.min(axis=0) + line.max(axis=0)) / 2
+    return polyline(body, (line - middle) * ((1 - slack) * rest_length / length))
+
+
+def _arc(centre: tuple[float, float], radius: float, start: float, end: float) -> np.ndarray:
+    """Points of an arc from one angle to another, degrees, half a degree apart."""
+    angle = np.deg2rad(np.linspace(start, end, 1 + int(2 * abs(end - start))))
+    return np.array(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _s() -> np.ndarray:
+    upper = _arc((0.0, 1.0), 1.0, 0.0, 270.0)
+    return np.concatenate([upper, _arc((0.0, -1.0), 1.0, 90.0, -180.0)[1:]])
+
+
+def _u() -> np.ndarray:
+    bow = _arc((0.0, 0.0), 1.0, 180.0, 360.0)
+    return np.concatenate([[[-1.0, 2.0]], bow, [[1.0, 2.0]]])
+
+
+_LETTERS = {
+    "C": lambda: _arc((0.0, 0.0), 1.0, 45.0, 315.0),
+    "M": lambda: np.array([[-1.0, -1.0], [-1.0, 1.0], [0.0, 0.0], [1.0, 1.0], [1.0, -1.0]]),
+    "O": lambda: _arc((0.0, 0.0), 1.0, 95.0, 445.0),
+    "S": _s,
+    "U": _u,
+}
+
+
+def _cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
