@@ -16,6 +16,7 @@ from jaxsimp.dynamics import at_rest, make_simulation, settle
 from jaxsimp.tasks import Episode, Task, crumple, matching_distance, score, task_names
 
 ROPES = ("rope_straightening", "rope_folding")
+GARMENTS = ("t_shirt_sleeves_in", "trousers_leg_over_leg")
 FOLDS = ("cloth_side_folding", "cloth_diagonal_folding")
 # Costs are means of at most 400 float32 distances of up to 0.5 m: rounding adds up to some
 # 1e-7 relative an operation, far below this.
@@ -75,7 +76,7 @@ def test_goal_cost_of_a_fold_is_the_gap_between_its_layers(name, on_crease):
     # images, a radius above where they were. Both folds of 9 x 9 have 45 moving particles.
     task = make_task(name, 9)
     episode, radius = task.episode_fn(3), task.body.radius
-    gap = ((45 - on_crease) * 2 * radius + tasks.STILL_WEIGHT * on_crease * radius) / 45
+    gap = ((45 - on_crease) * 2 * radius + tasks.cloth.STILL_WEIGHT * on_crease * radius) / 45
     # Heights of 2 mm are differences of coordinates up to 0.2 m, rounded to 1e-8 m.
     assert cost_of(task, episode, episode.goal) == pytest.approx(gap, abs=1e-7)
 
@@ -84,7 +85,7 @@ def test_start_cost_of_rope_folding(x64):
     # 11 of 41 particles; the assignment by SciPy, the positions written out: rope particle at
     # arc s goes to the left or the right side of an equilateral triangle of side L/2.
     task = tasks.make_task("rope_folding", 41)  # not one that a float32 test has traced
-    side = tasks.ROPE_LENGTH / 2
+    side = tasks.rope.ROPE_LENGTH / 2
     s = np.arange(0, 41, 4) / 40 * 2 * side
     height = np.sqrt(3) / 2 * side
     goal = np.stack([-side / 2 + s / 2, height / 2 - height * np.abs(s / side - 1)], axis=1)
@@ -287,14 +288,14 @@ def test_gradients_are_those_of_finite_differences(name, x64):
 @pytest.fixture(scope="module")
 def crumpled():
     """A short rope and what it looks like after four picks, for three seeds."""
-    body = rope(11, tasks.ROPE_LENGTH)
+    body = rope(11, tasks.rope.ROPE_LENGTH)
     return body, [crumple(body, seed) for seed in range(3)]
 
 
 def test_a_crumpled_rope_is_the_same_for_the_same_seed_only(crumpled):
     body, shapes = crumpled
     np.testing.assert_array_equal(crumple(body, 1), shapes[1])
-    again = rope(11, tasks.ROPE_LENGTH)  # an equal body, compiled anew
+    again = rope(11, tasks.rope.ROPE_LENGTH)  # an equal body, compiled anew
     np.testing.assert_array_equal(crumple(again, 1), shapes[1])
     for first, second in [(0, 1), (0, 2), (1, 2)]:
         assert np.abs(shapes[first] - shapes[second]).max() > 0.05
@@ -333,14 +334,23 @@ def test_straightening_starts_crumpled():
 
 
 def test_the_four_tasks_of_the_paper_are_registered():
-    assert set(task_names()) == {*ROPES, *FOLDS}
+    assert set(task_names("paper")) == {*ROPES, *FOLDS}
+
+
+def test_groups_are_all_tasks():
+    assert set(task_names()) == {*task_names("paper"), *task_names("goals")}
+    assert len(task_names("goals")) == 8
+    assert task_names("none") == ()
 
 
 @pytest.mark.parametrize("name", task_names())
 @pytest.mark.parametrize("resolution", [5, 6, 13])
 def test_tasks_have_other_resolutions(name, resolution):
     task = make_task(name, resolution)
-    assert task.body.shape == (resolution,) * len(task.body.shape)
+    if name in GARMENTS:
+        assert task.body.num_particles == pytest.approx(resolution**2, rel=0.15)
+    else:
+        assert task.body.shape == (resolution,) * len(task.body.shape)
     assert task.goal.shape == task.body.rest.shape
     simulation = task.simulation()
     assert float(simulation.time_step) == pytest.approx(task.time_step, rel=1e-6)
@@ -352,7 +362,7 @@ def test_tasks_have_other_resolutions(name, resolution):
 def test_scales(name):
     full, quick = make_task(name), make_task(name, quick=True)
     assert quick.body.num_particles < full.body.num_particles
-    assert make_task(name, 7, quick=True).body.shape[0] == 7
+    assert make_task(name, 7, quick=True).body.num_particles < quick.body.num_particles
     assert full.name == name
 
 
@@ -368,7 +378,7 @@ def test_low_resolution_is_refused(resolution):
 
 
 def test_a_name_is_taken_once(monkeypatch):
-    monkeypatch.setattr(tasks, "_REGISTRY", dict(tasks._REGISTRY))
+    monkeypatch.setattr(tasks.task, "_REGISTRY", dict(tasks.task._REGISTRY))
     with pytest.raises(ValueError, match="'rope_folding' is registered already"):
         tasks.register("rope_folding", full=9, quick=5)
     made = []

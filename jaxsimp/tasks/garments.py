@@ -1,0 +1,21 @@
+"""Tasks of garments."""
+
+from jaxsimp import garments, goals
+from jaxsimp.tasks.cloth import flat_task
+from jaxsimp.tasks.task import Task, register
+
+
+@register("t_shirt_sleeves_in", full=25, quick=15, group="goals")
+def t_shirt_sleeves_in(resolution: int) -> Task:
+    """Turn both sleeves of a T-shirt in."""
+    shirt = garments.t_shirt(num_particles=resolution**2)
+    goal = goals.fold_sequence(shirt.body, goals.sleeves_in(shirt))
+    return flat_task("t_shirt_sleeves_in", shirt.body, goal, num_actions=2)
+
+
+@register("trousers_leg_over_leg", full=25, quick=15, group="goals")
+def trousers_leg_over_leg(resolution: int) -> Task:
+    """Turn one leg of a pair of trousers over onto the other."""
+    trousers = garments.trousers(num_particles=resolution**2)
+    goal = goals.fold_sequence(trousers.body, goals.leg_over_leg(trousers))
+    return flat_task("trousers_leg_over_leg", trousers.body, goal, num_actions=4)

@@ -1,0 +1,138 @@
+"""What a task is, how states are scored, and the registry of tasks."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsimp import goals
+from jaxsimp.body import Body
+from jaxsimp.dynamics import Simulation, largest_time_step, make_simulation
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
+@dataclass(frozen=True)
+class Episode:
+    """Where one run starts and where it should end: positions, shape (N, 3), metres."""
+
+    start: Float[Array | np.ndarray, "N 3"]
+    goal: Float[Array | np.ndarray, "N 3"]
+
+
+CostFn = Callable[[Episode, Float[Array, "N 3"]], Float[Array, ""]]
+"""Cost of positions in an episode; pure JAX."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is asked of a planner.
+
+    Attributes:
+        name: in the registry.
+        body: what is manipulated.
+        goal: the goal configuration that key points are found in, shape (N, 3), metres.
+        episode_fn: from a seed to start and goal.
+        cost_fn: cost of positions in an episode, a scalar; pure JAX.
+        limits: largest displacement of one action along x, y, z, metres.
+        num_actions: actions in a plan, `T`.
+        num_pickers: `G`.
+        action_seconds: that one action takes.
+        settle_actions: as many times `action_seconds` pass, with nothing held, after the
+            last action and before the plan is scored.
+        longest_time_step: bound on the time step of the simulation, seconds.
+    """
+
+    name: str
+    body: Body
+    goal: Float[np.ndarray, "N 3"]
+    episode_fn: Callable[[int], Episode]
+    cost_fn: CostFn
+    limits: tuple[float, float, float]
+    num_actions: int = 4
+    num_pickers: int = 2
+    action_seconds: float = 0.3
+    settle_actions: int = 4
+    longest_time_step: float = 2e-3
+
+    def __post_init__(self) -> None:
+        goals.check_goal(self.body, self.goal)
+
+    def simulation(self) -> Simulation:
+        """The body's simulation, at the task's time step."""
+        return make_simulation(self.body, self.time_step)
+
+    @property
+    def time_step(self) -> float:
+        """Seconds: nine tenths of the largest stable one, and at most `longest_time_step`."""
+        return min(self.longest_time_step, 0.9 * largest_time_step(self.body))
+
+    @property
+    def action_steps(self) -> int:
+        """Time steps of one action."""
+        return round(self.action_seconds / self.time_step)
+
+
+def score(task: Task, episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
+    """Normalised score `(c_0 - c) / c_0`: 1 at the goal, 0 for a state as good as the start."""
+    start = task.cost_fn(episode, jnp.asarray(episode.start))
+    return (start - task.cost_fn(episode, position)) / start
+
+
+TaskFactory = Callable[[int], Task]
+
+_REGISTRY: dict[str, tuple[TaskFactory, int, int, str]] = {}
+
+
+def register(
+    name: str, *, full: int, quick: int, group: str = "others"
+) -> Callable[[TaskFactory], TaskFactory]:
+    """Add a task to the registry under a name.
+
+    Args:
+        name: of the task.
+        full: resolution of the task as it is studied.
+        quick: resolution for tests and smoke runs.
+        group: of tasks that are studied together: "paper" or "goals" here.
+
+    Raises:
+        ValueError: if the name is taken.
+    """
+    if name in _REGISTRY:
+        raise ValueError(f"task {name!r} is registered already; choose another name")
+
+    def add(factory: TaskFactory) -> TaskFactory:
+        _REGISTRY[name] = (factory, full, quick, group)
+        return factory
+
+    return add
+
+
+def task_names(group: str | None = None) -> tuple[str, ...]:
+    """Names of the registered tasks of a group, or of all."""
+    return tuple(name for name, entry in _REGISTRY.items() if group in (None, entry[3]))
+
+
+def make_task(name: str, resolution: int | None = None, *, quick: bool = False) -> Task:
+    """A registered task.
+
+    Args:
+        name: one of `task_names()`.
+        resolution: particles along the rope or along a side of the cloth; a garment has its
+            square of them. By default that of the full or the quick scale.
+        quick: which of the two scales is the default.
+
+    Raises:
+        ValueError: if there is no such task, or the resolution is too low for it.
+    """
+    if name not in _REGISTRY:
+        raise ValueError(f"unknown task {name!r}; choose from {', '.join(_REGISTRY)}")
+    factory, full, small, _ = _REGISTRY[name]
+    if resolution is None:
+        resolution = small if quick else full
+    if resolution < 5:
+        raise ValueError(f"resolution is {resolution}; a task needs at least 5 particles a side")
+    return factory(resolution)
