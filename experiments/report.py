@@ -1,4 +1,4 @@
-"""What the paper's study leaves behind: summary.json, figures, and a report that shows them."""
+"""What a study of plans leaves behind: summary.json, figures, and a report that shows them."""
 
 from collections import defaultdict
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.paper import PLANS_FOLDER, SUCCESS_SCORE, Study, key_points
+from experiments.plans import PLANS_FOLDER, Study, key_points
 from experiments.records import write_json
 from jaxsimp import viz
 from jaxsimp.planning import load_plan
@@ -30,7 +30,7 @@ def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     tasks = {name: study.task(name) for name in study.tasks}
-    models = {name: key_points(task) for name, task in tasks.items()}
+    models = {name: key_points(study, name) for name in tasks}
     rows = summary["runs"]
     _save(viz.plot_model_errors(models), figures / "model_errors.png")
     shown = {name: (task.body, task.goal, models[name]) for name, task in tasks.items()}
@@ -105,10 +105,10 @@ def success_interval(successes: int, count: int) -> tuple[float, float]:
 
 def _report(study: Study, summary: dict[str, Any]) -> str:
     lines = [
-        "# Goal-conditioned model simplification: the paper's study",
+        f"# Goal-conditioned model simplification: the study {study.name!r}",
         "",
-        f"A plan succeeds when its settled score is at least {SUCCESS_SCORE}. Score 1 is the goal, "
-        f"0 the start. {study.seeds} seeds a row; intervals are 95 % "
+        f"A plan succeeds when its settled score is at least {study.success_score}. Score 1 is "
+        f"the goal, 0 the start. {study.seeds} seeds a row; intervals are 95 % "
         "(Wilson for rates, Student's t in the figures).",
         "",
         *_model_table(summary["models"]),

@@ -1,17 +1,18 @@
 """Run a study: `python -m experiments.run`. All options: `python -m experiments.run --help`."""
 
 import dataclasses
+import inspect
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import ClassVar, Literal
 
 import tyro
 from rich.console import Console
 
 from experiments import records
-from experiments.paper import ACTION_SPACES, Study, run_study
+from experiments.plans import ACTION_SPACES, Study, run_study
 from jaxsimp.planning import ENCODINGS
 from jaxsimp.tasks import make_task, task_names
 
@@ -20,16 +21,16 @@ INTERRUPTED = 130
 
 
 @dataclass(frozen=True)
-class Options:
-    """Key points of the paper's goals, and plans over them and over all particles.
+class PlanOptions:
+    """Options of studies of plans."""
 
-    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
-    """
+    NAME: ClassVar[str]
+    SUCCESS_SCORE: ClassVar[float] = 0.9
 
-    study: Annotated[Literal["paper"], tyro.conf.Positional] = "paper"
-    """What is run: "paper" reproduces its four tasks."""
     tasks: tuple[str, ...] = task_names()
     """Tasks to plan for."""
+    method: str = "robust"
+    """How goals are simplified: robust, paper or meshlab."""
     action_spaces: tuple[str, ...] = ACTION_SPACES
     """Particles that may be grasped."""
     pick_encodings: tuple[str, ...] = tuple(ENCODINGS)
@@ -73,12 +74,15 @@ class Options:
         """
         names = [
             field.name
-            for field in dataclasses.fields(Options)
+            for field in dataclasses.fields(PlanOptions)
             if field.default is None and field.name not in ("resolution", "num_actions", "out")
         ]
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return Study(
+            name=self.NAME,
             tasks=self.tasks,
+            method=self.method,
+            success_score=self.SUCCESS_SCORE,
             action_spaces=self.action_spaces,
             pick_encodings=self.pick_encodings,
             seeds=min(self.seeds, 2) if self.smoke else self.seeds,
@@ -92,37 +96,91 @@ class Options:
     @property
     def folder(self) -> Path:
         """Where results go."""
-        return self.out or Path("results") / ("paper-smoke" if self.smoke else "paper")
+        return self.out or Path("results") / (f"{self.NAME}-smoke" if self.smoke else self.NAME)
+
+    def run(self, console: Console) -> None:
+        """Run the study, or list what it can be asked for."""
+        if self.list:
+            _list(console)
+            return
+        study = self.configuration()
+        records.open_folder(self.folder, study.identity())
+        # Here, so that --help and wrong options do not wait for matplotlib.
+        from experiments.report import write_report
+
+        start = time.perf_counter()
+        summary = run_study(study, self.folder, console)
+        write_report(study, summary, self.folder)
+        minutes = (time.perf_counter() - start) / 60
+        console.print(f"done in {minutes:.1f} minutes: {self.folder}/report.md")
+
+
+@dataclass(frozen=True)
+class PaperOptions(PlanOptions):
+    """The paper's four tasks: key points of their goals, plans over them and over all particles.
+
+    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    """
+
+    NAME: ClassVar[str] = "paper"
+
+    tasks: tuple[str, ...] = task_names("paper")
+    """Tasks to plan for."""
+    method: str = "paper"
+    """How goals are simplified: robust, paper or meshlab."""
+
+
+@dataclass(frozen=True)
+class GoalsOptions(PlanOptions):
+    """Harder goals, planned as the paper's are: letters, folds in sequence, garments.
+
+    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    """
+
+    NAME: ClassVar[str] = "goals"
+    SUCCESS_SCORE: ClassVar[float] = 0.8
+
+    tasks: tuple[str, ...] = task_names("goals")
+    """Tasks to plan for."""
+    pick_encodings: tuple[str, ...] = ("categorical",)
+    """How CEM encodes what is grasped."""
+
+
+STUDIES: dict[str, type[PlanOptions]] = {
+    options.NAME: options for options in (PaperOptions, GoalsOptions)
+}
+"""Options of the studies by name; the first one is run where none is named."""
 
 
 def main() -> int:
     """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
-    options = tyro.cli(Options, prog="python -m experiments.run")
     console = Console()
-    if options.list:
-        _list(console)
-        return 0
     try:
-        study = options.configuration()
-        records.open_folder(options.folder, study.identity())
-        _run(study, options.folder, console)
+        name, arguments = _study(sys.argv[1:])
+        options = tyro.cli(
+            STUDIES[name],
+            prog=f"python -m experiments.run {name}",
+            args=arguments,
+            description=f"{inspect.getdoc(STUDIES[name])}\n\nStudies: {', '.join(STUDIES)}.",
+        )
+        options.run(console)
     except (ValueError, records.ResultsError) as error:
         Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
         return 2
     except KeyboardInterrupt:
-        console.print(f"\ninterrupted; the same command goes on from {options.folder}")
+        console.print("\ninterrupted; the same command goes on where it was")
         return INTERRUPTED
     return 0
 
 
-def _run(study: Study, folder: Path, console: Console) -> None:
-    # Here, so that --help and wrong options do not wait for matplotlib.
-    from experiments.report import write_report
-
-    start = time.perf_counter()
-    summary = run_study(study, folder, console)
-    write_report(study, summary, folder)
-    console.print(f"done in {(time.perf_counter() - start) / 60:.1f} minutes: {folder}/report.md")
+def _study(arguments: list[str]) -> tuple[str, list[str]]:
+    """The name of the study, the first argument if there is one, and the other arguments."""
+    if not arguments or arguments[0].startswith("-"):
+        return next(iter(STUDIES)), arguments
+    name, *others = arguments
+    if name not in STUDIES:
+        raise ValueError(f"unknown study {name!r}; choose from {', '.join(STUDIES)}")
+    return name, others
 
 
 def _list(console: Console) -> None:

@@ -6,7 +6,7 @@ from jaxsimp.simplify.cloth_quadric import simplify_quadric
 from jaxsimp.simplify.keypoints import KeyPoints
 from jaxsimp.simplify.rope_uniform import simplify_uniform
 
-__all__ = ["KeyPoints", "simplify", "simplify_quadric", "simplify_uniform"]
+__all__ = ["METHODS", "KeyPoints", "simplify", "simplify_quadric", "simplify_uniform"]
 
 # A method is one function for ropes and one for surfaces.
 METHODS = {"paper": (simplify_uniform, simplify_quadric)}

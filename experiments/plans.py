@@ -1,8 +1,8 @@
-"""The paper's study: key points of the four goals, then plans over them and over all particles.
+"""Studies of plans: key points of goals, then plans over them and over all particles.
 
-`BUDGETS` holds the settings of the paper's author beside those that end in minutes.
-Sheng Yin et al. are followed where the paper or its author's code says how; `BUDGETS` says
-where the default differs to end in minutes.
+The paper's study is that of its four tasks, with its own simplification. Sheng Yin et al. are
+followed where the paper or its author's code says how: `BUDGETS` holds the author's settings
+beside those that end in minutes.
 """
 
 import dataclasses
@@ -24,10 +24,9 @@ from jaxsimp.planning import (
     Planner,
     save_plan,
 )
-from jaxsimp.simplify import KeyPoints, simplify
+from jaxsimp.simplify import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
 
-SUCCESS_SCORE = 0.9
 ACTION_SPACES = ("key_points", "all_particles")
 ROWS_FILE = "runs.jsonl"
 PLANS_FOLDER = "plans"
@@ -75,7 +74,10 @@ class Study:
     """One configuration of the study: what makes two results comparable.
 
     Attributes:
+        name: of the study.
         tasks: names of the tasks.
+        method: of simplification.
+        success_score: least settled score of a plan that succeeds.
         action_spaces: which particles may be grasped.
         pick_encodings: names of the encodings.
         seeds: every combination is run with the seeds 0 to `seeds` - 1.
@@ -86,7 +88,10 @@ class Study:
         num_actions: actions in a plan, instead of the budget's or the task's.
     """
 
+    name: str
     tasks: tuple[str, ...]
+    method: str
+    success_score: float
     action_spaces: tuple[str, ...]
     pick_encodings: tuple[str, ...]
     seeds: int
@@ -98,6 +103,7 @@ class Study:
 
     def __post_init__(self) -> None:
         _require_known("task", self.tasks, task_names())
+        _require_known("method", (self.method,), tuple(METHODS))
         _require_known("action space", self.action_spaces, ACTION_SPACES)
         _require_known("pick encoding", self.pick_encodings, tuple(ENCODINGS))
         if self.seeds < 1:
@@ -143,7 +149,7 @@ def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) ->
 
 def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     """Run what is not in the folder yet, and return the summary of everything in it."""
-    models = {name: key_points(study.task(name)) for name in study.tasks}
+    models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
     rows = records.read_rows(folder / ROWS_FILE)
@@ -196,7 +202,9 @@ def _run_all(
             compile_seconds = planner.compile_seconds
             for run in left[name]:
                 advance = partial(progress.advance, bar)
-                row = _run(planner, models[name], run, folder, environment, advance)
+                row = _run(planner, models[name], run, folder, advance)
+                row["success"] = (row["final_score"] or 0.0) >= study.success_score
+                row["environment"] = environment
                 row["compile_seconds"] += compile_seconds
                 compile_seconds = 0.0
                 records.append_row(folder / ROWS_FILE, row)
@@ -207,7 +215,6 @@ def _run(
     model: KeyPoints,
     run: tuple[str, str, int],
     folder: Path,
-    environment: dict[str, Any],
     on_population: Callable[[], None],
 ) -> dict[str, Any]:
     """Plan once, execute, save the plan, and return the row."""
@@ -233,14 +240,12 @@ def _run(
         "elite_cost_per_iteration": [_finite(cost) for cost in found.elite_costs],
         "final_cost": _finite(found.cost),
         "final_score": score,
-        "success": score is not None and score >= SUCCESS_SCORE,
         "rollouts": found.num_rollouts,
         "non_finite": found.non_finite,
         "plan_seconds": plan.seconds,
         "compile_seconds": plan.compile_seconds,
         "plan": file,
         "config": _row_config(planner),
-        "environment": environment,
     }
 
 
@@ -263,9 +268,10 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def key_points(task: Task) -> KeyPoints:
-    """The key points of a task's goal, the paper's way."""
-    return simplify(task.body, task.goal, method="paper")
+def key_points(study: Study, name: str) -> KeyPoints:
+    """The key points of a task's goal."""
+    task = study.task(name)
+    return simplify(task.body, task.goal, method=study.method)
 
 
 def _identity(row: dict[str, Any]) -> tuple[str, str, str, int]:
