@@ -130,7 +130,7 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
         # The corner lies to the left of the line through the middles of its sides.
         return tuple(
             _fold_about((a * x / 2, b * y / 2), (b, -a))
-            for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+            for a, b in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
         )
     raise ValueError(
         f"fold is {name!r}; choose one of side, diagonal, quarter, letter, four_corners"
