@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from jaxsimp import goals, viz
-from jaxsimp.body import cloth, rope
+from jaxsimp.body import cloth, from_mesh, rope
+from jaxsimp.garments import skirt
 from jaxsimp.simplify import KeyPoints
 
 
@@ -144,6 +145,36 @@ def test_an_execution_that_failed_is_drawn_without_its_lost_frames(body):
     figure = viz.plot_executions(body, start, {"failed": (frames, -np.inf)}, "a_task")
     figure.canvas.draw()
     assert np.all(np.isfinite(figure.axes[0].get_xlim()))
+
+
+def ball():
+    import trimesh
+
+    solid = trimesh.creation.icosphere(subdivisions=1, radius=0.1)
+    return from_mesh(np.array(solid.vertices), np.array(solid.faces))
+
+
+@pytest.mark.parametrize(
+    ("make", "around"),
+    [
+        (lambda: cloth((5, 4), (0.3, 0.2)), 1.0),
+        (lambda: skirt(0.3, 0.2, hem=0.2, num_particles=80).body, 1.0),
+        (ball, 0.0),
+    ],
+    ids=["cloth", "skirt", "ball"],
+)
+def test_a_surface_of_any_topology_is_drawn_with_its_boundary(make, around):
+    body = make()
+    axes = plt.figure().add_subplot(projection="3d")
+    viz.draw_body(axes, body, goals.flat(body), "red")
+    surface, *lines = axes.collections
+    assert len(surface.get_facecolor()) == len(body.faces)
+    segments = np.concatenate(
+        [np.array(line._segments3d) for line in lines] or [np.zeros((0, 2, 3))]
+    )
+    drawn = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum()
+    assert drawn == pytest.approx(around)
+    axes.figure.canvas.draw()
 
 
 def test_importing_viz_does_not_import_matplotlib():

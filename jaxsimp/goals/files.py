@@ -44,7 +44,8 @@ def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positio
         return made, check_goal(made, positions)
     except ValueError as error:
         message = str(error)
-        raise ValueError(message if str(path) in message else f"{path}: {message}") from error
+        named = message.startswith(str(path))
+        raise ValueError(message if named else f"{path}: {message}") from error
 
 
 def _read_arrays(path: str | Path) -> dict[str, np.ndarray]:

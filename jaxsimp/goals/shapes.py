@@ -117,14 +117,16 @@ def lift_crossings(body: Body, positions: Positions) -> Positions:
     for second in range(2, len(steps)):
         away = positions[second, :2] - positions[: second - 1, :2]
         first_step, second_step = steps[: second - 1], steps[second]
-        # Shares of both steps at which their lines cross; parallel ones do not.
+        # Shares of both steps at which their lines cross; parallel ones do not. A crossing at a
+        # particle is found at least once whatever the rounding.
         area = _cross_product(first_step, second_step)
-        safe = np.where(area == 0, np.inf, area)
-        on_first = _cross_product(away, second_step) / safe
-        on_second = _cross_product(away, first_step) / safe
-        crosses = (
-            (area != 0) & (on_first >= 0) & (on_first < 1) & (on_second >= 0) & (on_second < 1)
-        )
+        lengths = np.linalg.norm(first_step, axis=1) * np.linalg.norm(second_step)
+        parallel = np.abs(area) <= 1e-9 * lengths
+        area = np.where(parallel, 1.0, area)
+        on_first = _cross_product(away, second_step) / area
+        on_second = _cross_product(away, first_step) / area
+        both = np.stack([on_first, on_second])
+        crosses = ((both > -1e-9) & (both < 1 + 1e-9)).all(axis=0) & ~parallel
         for first in np.flatnonzero(crosses):
             share = on_first[first]
             below = (1 - share) * lifted[first, 2] + share * lifted[first + 1, 2]
