@@ -187,7 +187,7 @@ def test_closed_form_compiles_once_for_a_shape():
 
 
 def test_closed_form_refuses_a_box_by_name():
-    with pytest.raises(ValueError, match=r"'closed_form' has no box .* 'proxsuite'"):
+    with pytest.raises(ValueError, match=r"'closed_form' has no inequalities.* 'proxsuite'"):
         solve(one(np.eye(1), [0], lower=[0]), "closed_form")
 
 
