@@ -75,10 +75,13 @@ class Solution:
     Attributes:
         x: minimisers, shape (B, n); NaN exactly in the rows that are not solved.
         status: `Status` of each problem, shape (B,).
+        multipliers: of the inequalities C x, shape (B, k): above zero where the upper bound
+            holds x back, below zero where the lower one does; no meaning where not solved.
     """
 
     x: Float[np.ndarray, "B n"]
     status: Int[np.ndarray, " B"]
+    multipliers: Float[np.ndarray, "B k"]
 
     @property
     def solved(self) -> np.ndarray:
@@ -100,12 +103,13 @@ def solve(problem: QuadraticProgram, backend: str = "proxsuite") -> Solution:
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend is {backend!r}; choose one of {', '.join(BACKENDS)}")
-    x, status = BACKENDS[backend](problem)
-    status = np.where(_crossed(problem), Status.INFEASIBLE, status)
-    return Solution(np.where((status == Status.SOLVED)[:, None], x, np.nan), status)
+    solution = BACKENDS[backend](problem)
+    status = np.where(_crossed(problem), Status.INFEASIBLE, solution.status)
+    x = np.where((status == Status.SOLVED)[:, None], solution.x, np.nan)
+    return Solution(x, status, solution.multipliers)
 
 
-def _closed_form(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
+def _closed_form(problem: QuadraticProgram) -> Solution:
     if any(each is not None for each in (problem.lower, problem.upper, problem.C)):
         raise ValueError(
             "the backend 'closed_form' has no inequalities; leave lower, upper and C out, or use "
@@ -115,7 +119,7 @@ def _closed_form(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
     A = np.zeros((len(problem), 0, size)) if problem.A is None else problem.A
     b = np.zeros((len(problem), 0)) if problem.b is None else problem.b
     x, status = closed_form(*map(jnp.asarray, (problem.H, problem.g, A, b)))
-    return np.asarray(x), np.asarray(status)
+    return Solution(np.asarray(x), np.asarray(status), np.zeros((len(problem), 0)))
 
 
 @jax.jit
@@ -159,7 +163,7 @@ def _null_space_method(H: Array, g: Array, A: Array, b: Array) -> tuple[Array, A
     return x, jnp.where(apart, int(Status.INFEASIBLE), status)
 
 
-def _proxsuite(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
+def _proxsuite(problem: QuadraticProgram) -> Solution:
     from proxsuite import proxqp
 
     size, num_equal = problem.g.shape[1], 0 if problem.b is None else problem.b.shape[1]
@@ -172,32 +176,34 @@ def _proxsuite(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
         qp.init(H, g, A, b, C, C_lower, C_upper, lower, upper)
         batch.append(qp)
     proxqp.dense.solve_in_parallel(batch)
-    x = np.array([qp.results.x for qp in batch]).reshape(-1, size)
-    return x, _statuses([qp.results.info.status for qp in batch])
+    return Solution(
+        np.array([qp.results.x for qp in batch]).reshape(-1, size),
+        _statuses([qp.results.info.status for qp in batch]),
+        np.array([qp.results.z for qp in batch]).reshape(-1, num_inequal + size)[:, :num_inequal],
+    )
 
 
-def _qpsolvers(problem: QuadraticProgram) -> tuple[np.ndarray, np.ndarray]:
+def _qpsolvers(problem: QuadraticProgram) -> Solution:
     import qpsolvers
 
     x, codes = np.zeros_like(problem.g), []
+    multipliers = np.zeros((len(problem), 0 if problem.C is None else problem.C.shape[1]))
     for index, (H, g, A, b, C, C_lower, C_upper, lower, upper) in enumerate(_problems(problem)):
-        G, h = _one_sided(C, C_lower, C_upper)
+        G, h = None, None
+        if C is not None:
+            sides, h = np.concatenate([C, -C]), np.concatenate([C_upper, -C_lower])
+            bounded = h < np.inf
+            G, h = sides[bounded], h[bounded]
         one = qpsolvers.Problem(H, g, G, h, A, b, lower, upper)
         solution = qpsolvers.solve_problem(one, "proxqp", **PROXQP_SETTINGS)
         codes.append(solution.extras["info"].status)
         if solution.found:
             x[index] = solution.x
-    return x, _statuses(codes)
-
-
-def _one_sided(
-    C: np.ndarray | None, lower: np.ndarray | None, upper: np.ndarray | None
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The inequalities of one problem as G x <= h, without those that bound nothing."""
-    if C is None or lower is None or upper is None:
-        return None, None
-    G, h = np.concatenate([C, -C]), np.concatenate([upper, -lower])
-    return (G[h < np.inf], h[h < np.inf]) if (h < np.inf).any() else (None, None)
+            if C is not None:
+                z = np.zeros(len(sides))
+                z[bounded] = solution.z
+                multipliers[index] = z[: len(C)] - z[len(C) :]
+    return Solution(x, _statuses(codes), multipliers)
 
 
 def _statuses(codes: list) -> np.ndarray:
@@ -296,7 +302,7 @@ def _check_convex(H: np.ndarray) -> None:
 
 
 BOUNDS = ("lower", "upper", "C_lower", "C_upper")
-Backend = Callable[[QuadraticProgram], tuple[np.ndarray, np.ndarray]]
+Backend = Callable[[QuadraticProgram], Solution]
 BACKENDS: dict[str, Backend] = {
     "closed_form": _closed_form,
     "proxsuite": _proxsuite,

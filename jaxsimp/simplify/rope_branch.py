@@ -142,7 +142,8 @@ def _cost(
     """Squared error of the best fit with breakpoints at the particles `fit`."""
     chain, longer = np.zeros(5), np.zeros(5)
     _start(points, chain)
-    for start, end in zip(fit[:-1], fit[1:]):  # noqa: B905, numba's zip has no `strict`
+    for place in range(1, len(fit)):
+        start, end = fit[place - 1], fit[place]
         _extend(lines[start, end], stiffness[:, end - start], chain, longer)
         chain[:] = longer
     return _close(chain, points[-1])

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-
 ROUNDING = 1e-7
 """Part of the sum of squares that bounds give away, so that float32 cannot raise them."""
 
@@ -46,17 +45,24 @@ class Search(NamedTuple):
 def search_batch(goals: Float[np.ndarray, "B N 3"], max_size: int) -> Search:
     """`search` for a batch of any number of goals, anywhere in space.
 
-    Goals are centred before the default float32 rounds their distance from the origin away.
-    A batch is filled up to a power of two, so that few sizes of batches are compiled.
-
     Args:
         goals: shape (B, N, 3), metres.
         max_size: largest number of key points, 2 to N.
     """
-    count = len(goals)
-    filled = np.zeros((1 << max(count - 1, 0).bit_length(), *goals.shape[1:]))
-    filled[:count] = goals - goals.mean(axis=1, keepdims=True)
-    return Search(*(np.asarray(each)[:count] for each in search(filled, max_size)))
+    return Search(*(np.asarray(each)[: len(goals)] for each in search(fill(goals), max_size)))
+
+
+def fill(goals: Float[np.ndarray, "B N 3"]) -> Float[np.ndarray, "B2 N 3"]:
+    """Goals, centred, as a batch of a power of two: few batch sizes are compiled.
+
+    They are centred before the default float32 rounds their distance from the origin away.
+
+    Args:
+        goals: shape (B, N, 3), metres.
+    """
+    filled = np.zeros((1 << max(len(goals) - 1, 0).bit_length(), *goals.shape[1:]))
+    filled[: len(goals)] = goals - goals.mean(axis=1, keepdims=True)
+    return filled
 
 
 @partial(jax.jit, static_argnames="max_size")
@@ -75,9 +81,7 @@ def search(goals: Float[Array | np.ndarray, "B N 3"], max_size: int) -> Search:
         goals: shape (B, N, 3), metres, centred.
         max_size: largest number of key points, 2 to N.
     """
-    return jax.lax.map(
-        partial(_search_one, max_size=max_size), jnp.asarray(goals), batch_size=64
-    )
+    return jax.lax.map(partial(_search_one, max_size=max_size), jnp.asarray(goals), batch_size=64)
 
 
 def _search_one(points: Array, max_size: int) -> Search:
