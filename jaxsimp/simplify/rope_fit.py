@@ -289,7 +289,7 @@ def _unsettled(
     return wrong.any(axis=1)
 
 
-def _turning(cuts: _Cuts) -> Float[np.ndarray, "B 3K 3K"]:
+def _turning(cuts: _Cuts) -> Float[np.ndarray, "B n n"]:
     """Hessian of the stiffness against turns."""
     d = cuts.directions
     across = np.eye(3) - d[..., :, None] * d[..., None, :]
@@ -298,7 +298,7 @@ def _turning(cuts: _Cuts) -> Float[np.ndarray, "B 3K 3K"]:
     return np.einsum("bjxm,bj,bjxn->bmn", rows, cuts.stiffness, rows)
 
 
-def _components(vectors: Float[np.ndarray, "B J M 3"]) -> Float[np.ndarray, "B J M 3K"]:
+def _components(vectors: Float[np.ndarray, "B J M 3"]) -> Float[np.ndarray, "B J M n"]:
     """Rows that take x, y, z of all breakpoints to components of segments along vectors.
 
     Args:
