@@ -5,7 +5,7 @@ C_lower <= C x <= C_upper. A batch holds B problems of one shape; what happens t
 reported as its status and never stops the others.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -105,8 +105,25 @@ def solve(problem: QuadraticProgram, backend: str = "proxsuite") -> Solution:
         raise ValueError(f"backend is {backend!r}; choose one of {', '.join(BACKENDS)}")
     solution = BACKENDS[backend](problem)
     status = np.where(_crossed(problem), Status.INFEASIBLE, solution.status)
+    # ProxQP overlooks some contradictions, such as those of parallel rows with two bounds each.
+    for index in np.flatnonzero(status == Status.NOT_CONVERGED).tolist():
+        if _contradictory(problem, index):
+            status[index] = Status.INFEASIBLE
     x = np.where((status == Status.SOLVED)[:, None], solution.x, np.nan)
     return Solution(x, status, solution.multipliers)
+
+
+def _contradictory(problem: QuadraticProgram, index: int) -> bool:
+    """Whether no point satisfies the constraints of one problem, by linear programming."""
+    from scipy.optimize import linprog
+
+    *_, A, b, C, C_lower, C_upper, lower, upper = next(_problems(problem, [index]))
+    rows = {}
+    if C is not None:
+        h = np.concatenate([C_upper, -C_lower])
+        rows = {"A_ub": np.concatenate([C, -C])[h < np.inf], "b_ub": h[h < np.inf]}
+    bounds = np.stack([lower, upper], axis=1)
+    return linprog(np.zeros(len(lower)), A_eq=A, b_eq=b, bounds=bounds, **rows).status == 2
 
 
 def _closed_form(problem: QuadraticProgram) -> Solution:
@@ -217,8 +234,8 @@ def _statuses(codes: list) -> np.ndarray:
     return np.array([ours.get(code, Status.NOT_CONVERGED) for code in codes], dtype=int)
 
 
-def _problems(problem: QuadraticProgram) -> Iterator[tuple]:
-    """H, g, A, b, C and its bounds, lower and upper of each problem, in float64.
+def _problems(problem: QuadraticProgram, indices: Iterable[int] | None = None) -> Iterator[tuple]:
+    """H, g, A, b, C and its bounds, lower and upper of problems, all by default, in float64.
 
     Bounds that cross are left out: ProxQP iterates for seconds on them, and does not call them
     infeasible.
@@ -230,7 +247,7 @@ def _problems(problem: QuadraticProgram) -> Iterator[tuple]:
         shape = problem.C.shape[:2]
         C_lower, C_upper = _open_bounds(problem.C_lower, problem.C_upper, shape, crossed)
     arrays = (problem.H, problem.g, problem.A, problem.b, problem.C, C_lower, C_upper, lower, upper)
-    for index in range(len(problem)):
+    for index in range(len(problem)) if indices is None else indices:
         yield tuple(None if each is None else each[index].astype(float) for each in arrays)
 
 

@@ -198,14 +198,14 @@ def fit_within(
         longest = np.diff(np.interp(breakpoints, np.arange(goals.shape[1]), limits.reach))
     cuts: _Cuts | None = None
     for _ in range(MAX_ROUNDS):
+        if not todo.size:
+            break
         positions[todo], status[todo], held = _solve(goals[todo], W[todo], limits, cuts, backend)
         if longest is None:
             break
         segments = np.diff(positions[todo], axis=1)
         again = _unsettled(segments, longest[todo], cuts)
         todo, segments, held = todo[again], segments[again], held[again]
-        if not todo.size:
-            break
         lengths = np.linalg.norm(segments, axis=2, keepdims=True)
         directions = segments / np.maximum(lengths, np.finfo(float).tiny)
         cuts = _Cuts(directions, longest[todo], held / longest[todo])
