@@ -208,7 +208,7 @@ def fit_within(
         todo, segments, held = todo[again], segments[again], held[again]
         lengths = np.linalg.norm(segments, axis=2, keepdims=True)
         directions = segments / np.maximum(lengths, np.finfo(float).tiny)
-        cuts = _Cuts(directions, longest[todo], held / longest[todo])
+        cuts = _Cuts(directions, longest[todo], np.maximum(held, 0.0) / longest[todo])
     else:
         positions[todo], status[todo] = np.nan, qp.Status.NOT_CONVERGED
     squared = np.sum((W @ positions - goals) ** 2, axis=2)
