@@ -26,7 +26,8 @@ from experiments.engines.workload import num_cores
 from jaxsimp.body import rope
 from jaxsimp.planning import ENCODINGS, CEMConfig, Plan, Planner
 from jaxsimp.simplify import qp, simplify
-from jaxsimp.simplify.rope_uniform import fit_rope, fit_rope_constrained, interpolation_matrix
+from jaxsimp.simplify.rope_fit import Limits, fit_within
+from jaxsimp.simplify.rope_uniform import fit_rope, interpolation_matrix, uniform_breakpoints
 from jaxsimp.tasks import make_task
 
 PLANNED_STEPS = (4, 150)
@@ -92,12 +93,11 @@ def plan_fold(planner: Planner, on_population: Callable[[], None] = lambda: None
 def line_fit(scale: Scale) -> Iterator[Row]:
     """Lines of a few key points fitted to goals of a rope, by each backend."""
     body = rope(scale.rope)
-    everywhere = np.full(3, np.inf)
+    breakpoints = uniform_breakpoints(scale.rope, LINE_SIZE)[None]
 
     def by_backend(backend: str, goals: np.ndarray) -> Callable[[], np.ndarray]:
-        return lambda: fit_rope_constrained(
-            goals, LINE_SIZE, -everywhere, everywhere, backend=backend
-        )[0]
+        each = np.repeat(breakpoints, len(goals), axis=0)
+        return lambda: fit_within(goals, each, Limits(), backend)[0]
 
     def by_product(goals: np.ndarray) -> Callable[[], np.ndarray]:
         return lambda: np.asarray(fit_rope(goals, LINE_SIZE)[0])

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import linprog
+from scipy.optimize import linprog, minimize
 
 from jaxsimp.simplify.qp import BACKENDS, QuadraticProgram, Status, closed_form, solve
 
@@ -121,6 +121,93 @@ def test_float32_is_close_to_float64(seed):
     assert single.x == pytest.approx(double.x, abs=SINGLE * size)
 
 
+def slab_problem(rng, batch=3, size=4, count=5):
+    """Random problems with inequalities on both sides, on one, and on none."""
+    free = random_problem(rng, batch, size)
+    C = rng.normal(size=(batch, count, size))
+    # Around the values of C at a random point, so that there is room.
+    middle = np.einsum("bkn,bn->bk", C, rng.normal(size=(batch, size)))
+    half = rng.uniform(0.05, 1.0, size=(batch, count))
+    lower, upper = middle - half, middle + half
+    lower[:, 0], upper[:, 1] = -np.inf, np.inf
+    lower[:, 2], upper[:, 2] = -np.inf, np.inf
+    return QuadraticProgram(free.H, free.g, C=C, C_lower=lower, C_upper=upper)
+
+
+@pytest.mark.parametrize("backend", ["proxsuite", "qpsolvers"])
+@given(seed=seeds)
+def test_inequalities_satisfy_the_optimality_conditions(backend, seed):
+    problem = slab_problem(np.random.default_rng(seed))
+    solution = solve(problem, backend)
+    assert solution.solved.all()
+    x, z = solution.x, solution.multipliers
+    reached = np.einsum("bkn,bn->bk", problem.C, x)
+    slope = np.einsum("bmn,bn->bm", problem.H, x) + problem.g
+    tolerance = EXACT * (1 + np.abs(z).max())
+    assert np.einsum("bkn,bk->bn", problem.C, z) == pytest.approx(-slope, abs=10 * tolerance)
+    assert (reached <= problem.C_upper + EXACT).all()
+    assert (reached >= problem.C_lower - EXACT).all()
+    # A multiplier pulls back from the bound that is reached, and there is none elsewhere.
+    assert (z[reached < problem.C_upper - EXACT] <= tolerance).all()
+    assert (z[reached > problem.C_lower + EXACT] >= -tolerance).all()
+
+
+@given(seed=seeds)
+def test_inequalities_match_a_nonlinear_solver(seed):
+    problem = slab_problem(np.random.default_rng(seed), batch=2)
+    solution = solve(problem)
+    for index in range(2):
+        H, g, C = problem.H[index], problem.g[index], problem.C[index]
+        rows = np.concatenate([C, -C])
+        bounds = np.concatenate([problem.C_upper[index], -problem.C_lower[index]])
+        rows, bounds = rows[np.isfinite(bounds)], bounds[np.isfinite(bounds)]
+        found = minimize(
+            lambda x, H=H, g=g: 0.5 * x @ H @ x + g @ x,
+            np.zeros(4),
+            jac=lambda x, H=H, g=g: H @ x + g,
+            constraints={"type": "ineq", "fun": lambda x, A=rows, b=bounds: b - A @ x},
+            method="SLSQP",
+            options={"ftol": 1e-14, "maxiter": 500},
+        )
+        x = solution.x[index]
+        # Both stop at about 1e-9 of the value; points differ by its root.
+        assert 0.5 * x @ H @ x + g @ x == pytest.approx(found.fun, rel=1e-6, abs=1e-6)
+        assert x == pytest.approx(found.x, abs=1e-3)
+
+
+@pytest.mark.parametrize("backend", ["proxsuite", "qpsolvers"])
+def test_inequalities_work_beside_a_box_and_equalities(backend):
+    # The nearest point to (1, 1, 1) with x + y = 1, x <= 0.2 and y + z <= 1.
+    problem = one(
+        np.eye(3),
+        [-1, -1, -1],
+        A=[[1, 1, 0]],
+        b=[1],
+        upper=[0.2, 5, 5],
+        C=[[0, 1, 1]],
+        C_upper=[1],
+    )
+    solution = solve(problem, backend)
+    assert solution.x[0] == pytest.approx([0.2, 0.8, 0.2], abs=EXACT)
+    assert solution.multipliers[0] == pytest.approx([0.8], abs=EXACT)  # 1 - z
+
+
+@pytest.mark.parametrize("backend", ["proxsuite", "qpsolvers"])
+def test_contradictory_inequalities_do_not_disturb_their_neighbours(backend):
+    rows = np.broadcast_to(np.array([[1.0, 1.0], [1.0, 1.0]]), (3, 2, 2))
+    problem = QuadraticProgram(
+        H=np.broadcast_to(np.eye(2), (3, 2, 2)),
+        g=np.zeros((3, 2)),
+        C=rows,
+        C_lower=np.array([[1.0, -9.0], [1.0, -9.0], [1.0, -9.0]]),
+        C_upper=np.array([[9.0, 9.0], [9.0, 0.0], [0.0, 9.0]]),  # the third crosses its own
+    )
+    solution = solve(problem, backend)
+    solved, infeasible = Status.SOLVED, Status.INFEASIBLE
+    assert solution.status.tolist() == [solved, infeasible, infeasible]
+    assert solution.x[0] == pytest.approx([0.5, 0.5], abs=EXACT)
+
+
 def test_a_box_that_holds_the_minimum_changes_nothing_and_one_that_does_not_clips_it():
     wide = solve(one(np.eye(2), [-1, -2], lower=[-5, -5], upper=[5, 5]))
     tight = solve(one(np.eye(2), [-1, -2], lower=[-5, -5], upper=[0.5, 5]))
@@ -186,9 +273,11 @@ def test_closed_form_compiles_once_for_a_shape():
     assert closed_form._cache_size() == 1
 
 
-def test_closed_form_refuses_a_box_by_name():
-    with pytest.raises(ValueError, match=r"'closed_form' has no box .* 'proxsuite'"):
+def test_closed_form_refuses_inequalities_by_name():
+    with pytest.raises(ValueError, match=r"'closed_form' has no inequalities.* 'proxsuite'"):
         solve(one(np.eye(1), [0], lower=[0]), "closed_form")
+    with pytest.raises(ValueError, match=r"'closed_form' has no inequalities"):
+        solve(one(np.eye(1), [0], C=[[1]], C_upper=[1]), "closed_form")
 
 
 def test_unknown_backends_are_refused():
@@ -207,6 +296,11 @@ def test_bad_numbers_are_refused():
         one(np.diag([1, -1]), [0, 0])
     with pytest.raises(ValueError, match="give both or neither"):
         one(np.eye(1), [0], A=[[1]])
+    for wrong in ({"C": [[1]]}, {"C_upper": [1]}):
+        with pytest.raises(ValueError, match="C or its bounds are missing"):
+            one(np.eye(1), [0], **wrong)
+    with pytest.raises(ValueError, match="C_upper of problem 0 is not finite"):
+        one(np.eye(1), [0], C=[[1]], C_upper=[np.nan])
 
 
 @pytest.mark.usefixtures("unchecked_shapes")

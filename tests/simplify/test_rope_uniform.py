@@ -6,24 +6,29 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jaxsimp import body, goals
-from jaxsimp.simplify import simplify, simplify_uniform
+from jaxsimp.simplify import Status, Workspace, simplify, simplify_batch, simplify_uniform
 from jaxsimp.simplify.keypoints import SIZES_BEYOND
-from jaxsimp.simplify.qp import Status
+from jaxsimp.simplify.rope_fit import Limits, fit_within
 from jaxsimp.simplify.rope_uniform import (
     breakpoint_particles,
     fit_rope,
-    fit_rope_constrained,
     interpolation_matrix,
+    uniform_breakpoints,
 )
 
 ROPE = body.rope()  # 41 particles, 0.5 m
 SINGLE = 1e-6  # metres: float32 on coordinates below 1 m, and some room
 DOUBLE = 1e-12
 EXACT = 1e-7  # metres: ProxQP stops at residuals of 1e-10
-FREE = np.full(3, np.inf)
 
 seeds = st.integers(0, 2**32 - 1)
 SIZES = st.sampled_from([2, 3, 5, 8])  # few, since each is compiled
+
+
+def one(goal, *arguments, **options):
+    """Key points of a batch of one."""
+    (points,) = simplify_uniform(ROPE, goal[None], *arguments, **options)
+    return points
 
 
 def random_goals(rng, batch=3, count=41):
@@ -96,69 +101,8 @@ def test_fit_commutes_with_vmap_and_keeps_the_dtype():
         assert fit_rope(batch.astype(float), 4)[0].dtype == np.float64
 
 
-@given(seed=seeds, size=SIZES)
-def test_constraints_are_satisfied_and_cost_something(seed, size):
-    rng = np.random.default_rng(seed)
-    batch = random_goals(rng)
-    lower, upper = np.array([-0.02, -np.inf, 0.004]), np.array([0.02, 0.03, np.inf])
-    positions, errors, status = fit_rope_constrained(batch, size, lower, upper)
-    assert (status == Status.SOLVED).all()
-    assert (positions >= lower - EXACT).all()
-    assert (positions <= upper + EXACT).all()
-    _, free = fit_rope(batch, size)
-    assert (errors >= np.asarray(free) - SINGLE).all()
-    fitted = interpolation_matrix(41, size) @ positions
-    assert errors == pytest.approx(
-        np.sqrt(np.sum((fitted - batch) ** 2, axis=(1, 2)) / 41), abs=EXACT
-    )
-    # No nearby point of the box is better: the programme is convex, so none is.
-    for _ in range(20):
-        other = np.clip(positions + rng.normal(scale=1e-3, size=positions.shape), lower, upper)
-        other_fit = interpolation_matrix(41, size) @ other
-        assert (np.sum((other_fit - batch) ** 2, axis=(1, 2)) >= errors**2 * 41 - EXACT).all()
-
-
-@pytest.mark.parametrize("backend", ["closed_form", "proxsuite", "qpsolvers"])
-@pytest.mark.usefixtures("x64")
-def test_fixed_ends_are_kept_and_backends_agree(backend):
-    batch = random_goals(np.random.default_rng(1))
-    positions, errors, status = fit_rope_constrained(
-        batch, 5, -FREE, FREE, fixed_ends=True, backend=backend
-    )
-    assert (status == Status.SOLVED).all()
-    assert positions[:, [0, -1]] == pytest.approx(batch[:, [0, -1]], abs=EXACT)
-    # Oracle: least squares for the inner breakpoints, the ends' share taken off.
-    W = interpolation_matrix(41, 5)
-    for goal, q, error in zip(batch, positions, errors, strict=True):
-        rest = goal - W[:, [0, -1]] @ goal[[0, -1]]
-        inner, *_ = np.linalg.lstsq(W[:, 1:-1], rest, rcond=None)
-        assert q[1:-1] == pytest.approx(inner, abs=EXACT)
-        expected = np.sqrt(np.sum((W[:, 1:-1] @ inner - rest) ** 2) / 41)
-        assert error == pytest.approx(expected, abs=EXACT)
-
-
-def test_without_constraints_the_programme_is_the_closed_form():
-    batch = random_goals(np.random.default_rng(2))
-    positions, errors, _ = fit_rope_constrained(batch, 6, -FREE, FREE)
-    expected, expected_errors = fit_rope(batch, 6)
-    assert positions == pytest.approx(np.asarray(expected), abs=SINGLE)
-    assert errors == pytest.approx(np.asarray(expected_errors), abs=SINGLE)
-
-
-def test_an_infeasible_goal_is_a_status_and_leaves_the_others_alone():
-    batch = random_goals(np.random.default_rng(3)) * [1, 1, 0.01] + [0, 0, 0.1]
-    batch[1, 0, 2] = -0.05  # an end below the table
-    lower = np.array([-np.inf, -np.inf, 0.004])
-    positions, errors, status = fit_rope_constrained(batch, 4, lower, FREE, fixed_ends=True)
-    assert status.tolist() == [Status.SOLVED, Status.INFEASIBLE, Status.SOLVED]
-    assert np.isnan(positions[1]).all()
-    assert errors[1] == np.inf
-    alone, *_ = fit_rope_constrained(batch[2:], 4, lower, FREE, fixed_ends=True)
-    assert positions[2] == pytest.approx(alone[0], abs=EXACT)
-
-
 def test_a_straight_rope_needs_its_ends():
-    points = simplify_uniform(ROPE, goals.straight(ROPE))
+    points = one(goals.straight(ROPE))
     assert points.particles.tolist() == [0, 40]
     assert points.elements.tolist() == [[0, 1]]
     assert points.positions == pytest.approx(goals.straight(ROPE)[[0, 40]], abs=SINGLE)
@@ -177,7 +121,7 @@ def test_polylines_of_equal_legs_give_their_corners(corners, particles):
     corners = np.array(corners, dtype=float)
     corners *= 0.5 / np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
     goal = goals.polyline(ROPE, corners)
-    points = simplify_uniform(ROPE, goal)
+    points = one(goal)
     assert points.particles.tolist() == particles
     assert points.sizes == tuple(range(2, len(particles) + 1 + SIZES_BEYOND))
     assert points.positions[:, :2] == pytest.approx(corners, abs=10 * SINGLE)
@@ -191,7 +135,7 @@ def test_every_size_is_tried_since_errors_are_not_monotone():
     assert errors[0] < SINGLE
     assert errors[2] < SINGLE
     assert errors[1] > 1e-3
-    points = simplify_uniform(ROPE, goal, tolerance=1e-4)
+    points = one(goal, tolerance=1e-4)
     assert points.sizes == (2, 3, 4, 5, 6)
     assert len(points) == 3
 
@@ -199,7 +143,7 @@ def test_every_size_is_tried_since_errors_are_not_monotone():
 def test_far_from_the_origin_float32_is_as_good():
     goal = goals.polyline(ROPE, np.array([[0, 0], [0.25, 0], [0.25, 0.25]]))
     goal = goal + np.array([1e4, -1e4, 0])
-    points = simplify_uniform(ROPE, goal, tolerance=1e-5)  # float32 at 1e4 m steps by 1e-3 m
+    points = one(goal, tolerance=1e-5)  # float32 at 1e4 m steps by 1e-3 m
     assert len(points) == 3
 
 
@@ -213,46 +157,94 @@ def test_key_particles_are_the_nearest_by_id(count, size):
     assert np.abs(ids - exact).max() <= 0.5 + 1e-9
 
 
+def test_without_constraints_the_programme_is_the_closed_form():
+    batch = random_goals(np.random.default_rng(2))
+    breakpoints = np.tile(uniform_breakpoints(41, 6), (3, 1))
+    positions, errors, _ = fit_within(batch, breakpoints, Limits())
+    expected, expected_errors = fit_rope(batch, 6)
+    assert positions == pytest.approx(np.asarray(expected), abs=SINGLE)
+    assert errors == pytest.approx(np.asarray(expected_errors), abs=SINGLE)
+
+
 def test_constraints_reach_the_key_points():
     goal = goals.straight(ROPE)
     goal[:, 2] -= 0.01
-    low = simplify_uniform(ROPE, goal, tolerance=0.02)
-    high = simplify_uniform(ROPE, goal, tolerance=0.02, above_table=True)
+    low = one(goal, 0.02)
+    high = one(goal, 0.02, workspace=Workspace(above_table=True))
     assert low.positions[:, 2].max() < 0
     assert high.positions[:, 2] == pytest.approx(ROPE.radius, abs=EXACT)
-    workspace = np.array([[-0.24, -1, -1], [0.24, 1, 1]])
-    boxed = simplify_uniform(ROPE, goal, tolerance=0.02, workspace=workspace)
-    assert np.abs(boxed.positions[:, 0]).max() <= 0.24 + EXACT
+    box = Workspace((-0.24, -1.0, -1.0), (0.24, 1.0, 1.0))
+    assert np.abs(one(goal, 0.02, workspace=box).positions[:, 0]).max() <= 0.24 + EXACT
     bent = goals.polyline(ROPE, np.array([[0, 0], [0.3, 0], [0.3, 0.2]]))
-    fixed = simplify_uniform(ROPE, bent, fixed_ends=True)
+    fixed = one(bent, workspace=Workspace(fixed_ends=True))
     assert fixed.positions[[0, -1]] == pytest.approx(bent[[0, -1]], abs=EXACT)
+    short = one(1.1 * goal, 0.03, workspace=Workspace(max_stretch=0.0))
+    assert np.ptp(short.positions[:, 0]) == pytest.approx(0.5, abs=2e-6)  # LENGTH_TOLERANCE
 
 
-def test_contradictory_constraints_are_refused_with_a_remedy():
-    goal = goals.straight(ROPE)
-    goal[0, 2] = -0.1
-    with pytest.raises(ValueError, match=r"INFEASIBLE; widen the workspace"):
-        simplify_uniform(ROPE, goal, above_table=True, fixed_ends=True)
+def test_failures_are_a_status_and_leave_the_others_alone():
+    rng = np.random.default_rng(4)
+    low = goals.straight(ROPE)
+    low[0, 2] = -0.1
+    bent = goals.polyline(ROPE, np.array([[0, 0], [0.25, 0], [0.25, 0.25]]))
+    wild = rng.uniform(0.1, 0.5, size=(41, 3))
+    workspace = Workspace(above_table=True, fixed_ends=True)
+    models = simplify_uniform(ROPE, np.stack([bent, low, wild, bent]), workspace=workspace)
+    assert [model.status for model in models] == [
+        Status.FITS,
+        Status.INFEASIBLE,
+        Status.NO_FIT,
+        Status.FITS,
+    ]
+    assert len(models[1]) == 0
+    assert models[2].sizes == tuple(range(2, 21))
+    assert not any(model.certified for model in models)
+    alone = one(bent, workspace=workspace)
+    for model in (models[0], models[3]):
+        assert model.particles.tolist() == alone.particles.tolist() == [0, 20, 40]
+        assert model.positions == pytest.approx(alone.positions, abs=EXACT)
+
+
+@given(seed=seeds)
+def test_models_of_a_batch_are_those_of_its_goals(seed):
+    batch = 3 * random_goals(np.random.default_rng(seed))
+    for goal, model in zip(batch, simplify_uniform(ROPE, batch, max_size=6), strict=True):
+        alone = one(goal, max_size=6)
+        assert model.sizes == alone.sizes
+        assert model.particles.tolist() == alone.particles.tolist()
+        assert model.positions == pytest.approx(alone.positions, abs=10 * SINGLE)
+        assert model.errors == pytest.approx(alone.errors, abs=SINGLE)
+
+
+def test_nothing_recompiles_for_a_new_batch_of_the_same_shape():
+    fit_rope.clear_cache()
+    for seed in (5, 6):
+        batch = random_goals(np.random.default_rng(seed), batch=4)
+        simplify_uniform(ROPE, batch, 1e-9, 4)
+    simplify_uniform(ROPE, batch[:3], 1e-9, 4)
+    assert fit_rope._cache_size() == 3  # sizes 2, 3 and 4
 
 
 def test_no_fit_names_the_best_error_the_tolerance_and_the_remedy():
     goal = random_goals(np.random.default_rng(4), batch=1)[0]
     message = r"up to 3 key points .* tolerance of 1e-09 m: .* off by 0\.\d+ m; raise tolerance"
     with pytest.raises(ValueError, match=message):
-        simplify_uniform(ROPE, goal, tolerance=1e-9, max_size=3)
+        simplify(ROPE, goal, method="paper", tolerance=1e-9, max_size=3)
 
 
 def test_more_key_points_than_particles_are_never_tried():
     small = body.rope(num_particles=4, length=0.3)
     goal = np.random.default_rng(5).normal(size=(4, 3))
-    points = simplify_uniform(small, goal, tolerance=1e-3, max_size=50)
+    (points,) = simplify_uniform(small, goal[None], 1e-3, 50)
     assert points.particles.tolist() == [0, 1, 2, 3]
 
 
 def test_the_entry_takes_a_rope():
     goal = goals.straight(ROPE)
-    assert simplify(ROPE, goal).particles.tolist() == [0, 40]
+    assert simplify(ROPE, goal, method="paper").method == "uniform breakpoints"
+    assert simplify(ROPE, goal).method == "optimal breakpoints"
     assert simplify(ROPE, goal, tolerance=0.1, max_size=2).tolerance == 0.1
+    assert [len(each) for each in simplify_batch(ROPE, goal[None])] == [2]
 
 
 @pytest.mark.parametrize(
@@ -265,20 +257,20 @@ def test_the_entry_takes_a_rope():
 )
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        simplify_uniform(ROPE, goals.straight(ROPE), **options)
+        one(goals.straight(ROPE), **options)
 
 
 def test_bad_arguments_are_refused():
     cloth = body.cloth((3, 3))
     with pytest.raises(ValueError, match=r"8 triangles; give a rope"):
-        simplify_uniform(cloth, goals.flat(cloth))
+        simplify_uniform(cloth, goals.flat(cloth)[None])
     goal = goals.straight(ROPE)
     goal[7] = np.nan
     with pytest.raises(ValueError, match=r"particle 7 is .* finite"):
         simplify(ROPE, goal)
     with pytest.raises(ValueError, match=r"the goal has shape \(40, 3\)"):
         simplify(ROPE, goals.straight(ROPE)[:40])
-    with pytest.raises(ValueError, match="method is 'best'; choose one of paper"):
+    with pytest.raises(ValueError, match="method is 'best'; choose one of robust"):
         simplify(ROPE, goals.straight(ROPE), method="best")
     with pytest.raises(ValueError, match="size is 42; a rope of 41 particles has 2 to 41"):
         interpolation_matrix(41, 42)
