@@ -1,4 +1,4 @@
-"""Key points of goals in files: `python -m experiments.simplify GOAL`; with `--help`, all options."""
+"""Key points of goals in files: `python -m experiments.simplify GOAL`."""
 
 import sys
 import time
