@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.body import Body, rope
-from jaxsimp.tasks.costs import distance, matching_cost
+from jaxsimp.tasks.costs import distance, distance_cost, matching_cost
 from jaxsimp.tasks.crumple import crumple
 from jaxsimp.tasks.task import Episode, Task, register
 
@@ -87,6 +87,7 @@ def rope_crossed_triangle(resolution: int) -> Task:
 
 
 def _shape_task(name: str, body: Body, goal: goals.Positions) -> Task:
+    """A goal from a straight start; the cost is the mean distance of particles to their goals."""
     start = goals.straight(body)
     return Task(
         name=name,
@@ -94,6 +95,6 @@ def _shape_task(name: str, body: Body, goal: goals.Positions) -> Task:
         goal=goal,
         limits=ROPE_LIMITS,
         episode_fn=lambda seed: Episode(start, goal),
-        cost_fn=matching_cost(body.num_particles),
+        cost_fn=distance_cost,
         num_actions=6,
     )
