@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from jaxsimp.simplify.rope_fit import hat_weights
 from jaxsimp.simplify.rope_search import (
     regression_gains,
+    ruled_out,
     search,
     search_batch,
     segment_stiffness,
@@ -135,6 +136,17 @@ def test_bounds_are_close_to_the_best_fits_of_noisy_polylines():
     found = search_batch(goal[None], 4)
     for size, bound in zip((2, 3), found.bounds[0], strict=False):
         assert bound > 0.9 * best_of_all(goal, size)[0]
+
+
+@given(seed=seeds, count=COUNTS)
+def test_what_is_ruled_out_is_not_there(seed, count):
+    goals = random_goals(np.random.default_rng(seed), count)
+    found = search_batch(goals, 6)
+    best = np.array([[best_of_all(goal, size)[0] for size in range(2, 7)] for goal in goals])
+    # Tolerances at and around what the bounds reach.
+    for tolerance in np.maximum(found.bounds, found.free_bounds).ravel() + 1e-9:
+        assert not (ruled_out(found, float(tolerance)) & (best < tolerance)).any()
+    assert ruled_out(found, 1e-9)[:, 0].all()
 
 
 def test_far_from_the_origin_nothing_changes():
