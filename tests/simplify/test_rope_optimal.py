@@ -271,6 +271,14 @@ def test_contradictory_constraints_are_a_status_and_leave_the_others_alone():
         assert model.positions[[0, -1]] == pytest.approx(bent[[0, -1]], abs=KEPT)
 
 
+def test_a_model_that_only_constraints_forbid_is_not_proven_away():
+    pulled = goals.straight(ROPE, 3.0)[None]
+    (free,) = simplify_optimal(ROPE, pulled, max_size=4)
+    (held,) = simplify_optimal(ROPE, pulled, max_size=4, workspace=Workspace(max_stretch=0.0))
+    assert (len(free), free.status, free.certified) == (2, Status.FITS, True)
+    assert (len(held), held.status, held.certified) == (4, Status.NO_FIT, False)
+
+
 def test_the_smallest_rope_and_an_empty_batch():
     pair = small_rope(2)
     (model,) = simplify_optimal(pair, np.array([[[0.0, 0, 0], [1, 0, 0]]]))
