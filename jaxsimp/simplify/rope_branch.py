@@ -62,7 +62,7 @@ def settle(
             )
             if least >= limit:
                 break
-            place, finished = place - 1, True
+            place -= 1
             cost[place] = least
         certified[index] = finished
         if place < most:

@@ -173,7 +173,7 @@ def fit_within(
     before, d·v <= L, and fitted again until d stays: then the optimality conditions are those of
     |v| <= L, and the fit is the best there is. Newton's method needs a handful of rounds for
     this: with what the length holds back, z, goes a stiffness z / L against turns away from d.
-    Without it (that is, with linear programming of the length alone) long goals never settle.
+    Without it the rounds circle around the fit where a goal is much longer than the rope.
 
     Args:
         goals: shape (B, N, 3), metres.

@@ -21,14 +21,13 @@ from jaxsimp.simplify.rope_models import (
 )
 from jaxsimp.simplify.rope_search import (
     regression_gains,
+    ruled_out,
     search_batch,
     segment_stiffness,
 )
 
 NODE_LIMIT = 1_000_000
 """Chains of segments looked at, for one goal and size, before giving up: about 10 ms."""
-ROUNDING = 1e-4
-"""How far, relative to itself, a bound in float32 may be above the true one: generous."""
 
 
 def simplify_optimal(
@@ -107,18 +106,17 @@ def _settle(
 ]:
     """The smallest free fits: column of the size, certified, and errors and breakpoints by size.
 
-    Errors are NaN further beyond the smallest fit than others are to know.
+    Errors are NaN for sizes more than `SIZES_BEYOND` larger than the smallest fit.
     """
     from jaxsimp.simplify.rope_branch import settle  # numba takes a while to import
 
     count = goals.shape[1]
     search = search_batch(goals, max_size)
-    bounds = np.maximum(search.bounds, search.free_bounds)
     breakpoints = np.array(search.breakpoints, dtype=np.int64)
     places, certified, costs = settle(
         goals - goals.mean(axis=1, keepdims=True),
         breakpoints,
-        bounds * (1 - ROUNDING) >= tolerance,
+        ruled_out(search, tolerance),
         count * tolerance**2,
         regression_gains(count, 0.5, 0.5),
         segment_stiffness(count),

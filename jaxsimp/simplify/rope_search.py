@@ -18,10 +18,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 ROUNDING = 1e-7
 """Part of the sum of squares that bounds give away, so that float32 cannot raise them."""
+BOUND_ROUNDING = 1e-4
+"""How far, relative to itself, a bound in float32 may be above the true one: generous."""
 CHUNK = 32
 """Goals at a time: their tables of segments stay in the processor's cache."""
 
@@ -65,6 +67,19 @@ def fill(goals: Float[np.ndarray, "B N 3"]) -> Float[np.ndarray, "B2 N 3"]:
     filled = np.zeros((1 << max(len(goals) - 1, 0).bit_length(), *goals.shape[1:]))
     filled[: len(goals)] = goals - goals.mean(axis=1, keepdims=True)
     return filled
+
+
+def ruled_out(search: Search, tolerance: float) -> Bool[np.ndarray, "B M"]:
+    """Whether the bounds prove that no fit of a size is below the tolerance, shape (B, M).
+
+    A model of K key points is then proven smallest, without branch and bound, by [:, K - 3].
+
+    Args:
+        search: of a batch.
+        tolerance: root mean square, metres.
+    """
+    bounds = np.maximum(search.bounds, search.free_bounds)
+    return bounds * (1 - BOUND_ROUNDING) >= tolerance
 
 
 @partial(jax.jit, static_argnames="max_size")

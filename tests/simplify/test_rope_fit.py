@@ -173,6 +173,24 @@ def slsqp(goal, breakpoints, longest, limits, near, rng):
     return np.sqrt(found.fun / len(goal))
 
 
+def test_rounds_go_on_until_directions_stay(monkeypatch):
+    rng = np.random.default_rng(5)
+    goals, breakpoints = random_goals(rng, 30), random_breakpoints(rng, 6, 30)
+    limits = limits_of(ROPE, Workspace(max_stretch=0.0))
+    positions = fit_within(goals, breakpoints, limits)[0]
+    monkeypatch.setattr(rope_fit, "LENGTH_TOLERANCE", 1e-8)
+    finer = fit_within(goals, breakpoints, limits)[0]
+    # Newton's last step is far below the tolerance of 1e-6 that ends it.
+    assert positions == pytest.approx(finer, abs=1e-5)
+
+
+def test_a_fit_that_a_stiffness_held_is_not_settled_though_it_is_short():
+    turned, longest = np.array([[[0.5, 0.01, 0.0]]]), np.ones((1, 1))
+    for stiffness, expected in ((1.0, True), (0.0, False)):
+        cuts = rope_fit._Cuts(np.array([[[1.0, 0.0, 0.0]]]), longest, np.full((1, 1), stiffness))
+        assert rope_fit._unsettled(turned, longest, cuts).tolist() == [expected]
+
+
 def test_a_length_that_does_not_bind_changes_nothing():
     rng = np.random.default_rng(2)
     goals, breakpoints = random_goals(rng), random_breakpoints(rng, 5)

@@ -59,7 +59,7 @@ def same(first, second):
 @given(seed=seeds, count=COUNTS)
 def test_models_equal_exhaustive_search(seed, count):
     rng = np.random.default_rng(seed)
-    batch = np.stack([random_goal(rng, count) for _ in range(3)])
+    batch = np.stack([random_goal(rng, count) for _ in range(2)])
     tolerance = float(rng.choice([0.002, 0.006, 0.015, 0.05]))
     models = simplify_optimal(small_rope(count), batch, tolerance, MOST)
     for goal, model in zip(batch, models, strict=True):
@@ -77,25 +77,39 @@ def test_models_equal_exhaustive_search(seed, count):
             assert model.sizes == tuple(range(2, min(size + SIZES_BEYOND, MOST) + 1))
 
 
-@given(seed=seeds, count=COUNTS)
-def test_branch_and_bound_alone_is_exact(seed, count):
-    rng = np.random.default_rng(seed)
-    goal = random_goal(rng, count)
-    goal -= goal.mean(axis=0)
-    tolerance = float(rng.choice([0.002, 0.015, 0.05]))
-    # The poorest of fits to start from, and nothing proven.
+def settle_from_nothing(goal, tolerance, node_limit):
+    """Branch and bound with the poorest of fits to start from, and nothing proven."""
+    count = len(goal)
     breakpoints = np.full((1, MOST - 1, MOST), count - 1)
     for size in range(2, MOST + 1):
         breakpoints[0, size - 2, : size - 1] = np.arange(size - 1)
-    places, certified, costs = settle(
+    found = settle(
         goal[None],
         breakpoints,
         np.zeros((1, MOST - 1), dtype=bool),
         count * tolerance**2,
         regression_gains(count, 0.5, 0.5),
         segment_stiffness(count),
-        10**6,
+        node_limit,
     )
+    return *found, breakpoints
+
+
+def test_branch_and_bound_that_gives_up_proves_nothing():
+    goal = np.random.default_rng(0).normal(size=(13, 3))
+    places, certified, *_ = settle_from_nothing(goal, 0.1, 10**6)
+    assert (places[0], certified[0]) == (MOST - 1, True)  # nothing fits
+    places, certified, *_ = settle_from_nothing(goal, 0.1, 3)
+    assert (places[0], certified[0]) == (MOST - 1, False)
+
+
+@given(seed=seeds, count=COUNTS)
+def test_branch_and_bound_alone_is_exact(seed, count):
+    rng = np.random.default_rng(seed)
+    goal = random_goal(rng, count)
+    goal -= goal.mean(axis=0)
+    tolerance = float(rng.choice([0.002, 0.015, 0.05]))
+    places, certified, costs, breakpoints = settle_from_nothing(goal, tolerance, 10**6)
     errors = [best_error(goal, size) for size in range(2, MOST + 1)]
     fits = [error < tolerance for error in errors]
     assert certified.tolist() == [True]
@@ -255,6 +269,14 @@ def test_contradictory_constraints_are_a_status_and_leave_the_others_alone():
         same(model, alone)
         assert model.particles.tolist() == [0, 16, 40]
         assert model.positions[[0, -1]] == pytest.approx(bent[[0, -1]], abs=KEPT)
+
+
+def test_a_model_that_only_constraints_forbid_is_not_proven_away():
+    pulled = goals.straight(ROPE, 3.0)[None]
+    (free,) = simplify_optimal(ROPE, pulled, max_size=4)
+    (held,) = simplify_optimal(ROPE, pulled, max_size=4, workspace=Workspace(max_stretch=0.0))
+    assert (len(free), free.status, free.certified) == (2, Status.FITS, True)
+    assert (len(held), held.status, held.certified) == (4, Status.NO_FIT, False)
 
 
 def test_the_smallest_rope_and_an_empty_batch():

@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from jaxsimp.simplify.rope_fit import hat_weights
 from jaxsimp.simplify.rope_search import (
     regression_gains,
+    ruled_out,
     search,
     search_batch,
     segment_stiffness,
@@ -83,7 +84,7 @@ def test_no_fit_is_below_the_bounds(seed, count):
     goals = random_goals(np.random.default_rng(seed), count)
     found = search_batch(goals, 6)
     for goal, bounds, free in zip(goals, found.bounds, found.free_bounds, strict=True):
-        for size, bound, free_bound in zip(range(2, 6), bounds, free, strict=False):
+        for size, bound, free_bound in zip(range(2, 7), bounds, free, strict=True):
             best, breakpoints = best_of_all(goal, size)
             assert bound <= best + SINGLE
             assert free_bound <= best + SINGLE
@@ -137,9 +138,21 @@ def test_bounds_are_close_to_the_best_fits_of_noisy_polylines():
         assert bound > 0.9 * best_of_all(goal, size)[0]
 
 
+@given(seed=seeds, count=COUNTS)
+def test_what_is_ruled_out_is_not_there(seed, count):
+    goals = random_goals(np.random.default_rng(seed), count)
+    found = search_batch(goals, 6)
+    best = np.array([[best_of_all(goal, size)[0] for size in range(2, 7)] for goal in goals])
+    # Tolerances at and around what the bounds reach.
+    for tolerance in np.maximum(found.bounds, found.free_bounds).ravel() + 1e-9:
+        assert not (ruled_out(found, float(tolerance)) & (best < tolerance)).any()
+    assert ruled_out(found, 1e-9)[:, 0].all()
+
+
 def test_far_from_the_origin_nothing_changes():
     goals = random_goals(np.random.default_rng(3), 12)
-    near, far = search_batch(goals, 5), search_batch(goals + np.array([10.0, -10.0, 10.0]), 5)
+    # In float32 numbers around 1e4 are 1e-3 apart.
+    near, far = search_batch(goals, 5), search_batch(goals + np.array([1e4, -1e4, 1e4]), 5)
     assert far.errors == pytest.approx(near.errors, abs=SINGLE)
     assert far.breakpoints.tolist() == near.breakpoints.tolist()
 
