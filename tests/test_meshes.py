@@ -223,7 +223,12 @@ def test_an_empty_triangle_that_fills_a_gap_stays():
     sheet = np.array([[0, 1, 3], [1, 2, 4], [4, 2, 3]])
     with pytest.raises(ValueError, match="2 pieces"):
         clean_mesh(points, sheet)
-    _, found = clean_mesh(points, np.concatenate([sheet, [[1, 4, 3]]]))
+    dirt = [[0, 1, 0], [0, 3, 1]]
+    _, found = clean_mesh(points, np.concatenate([sheet, [[1, 4, 3]], dirt]))
+    assert len(found) == 4
+    # So it does beside an empty triangle that fills nothing.
+    middle = np.concatenate([points, [[0.5, 0.0, 0.0]]])
+    _, found = clean_mesh(middle, np.concatenate([sheet, [[1, 4, 3], [0, 5, 1]]]))
     assert len(found) == 4
     # On the boundary the same triangle is dirt.
     _, found = clean_mesh(points, np.array([[1, 2, 4], [4, 2, 3], [1, 4, 3]]))

@@ -12,7 +12,7 @@ from jaxsimp.outlines import check_outline, mesh_outline, mesh_symmetric_outline
 SQUARE = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]])
 ELL = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.15], [0.15, 0.15], [0.15, 0.5], [0.0, 0.5]])
 TRIANGLE = np.array([[0.0, 0.0], [0.5, 0.0], [0.25, 0.3]])
-# Least angle of a triangle that Delaunay and smoothing leave in the shapes below, degrees.
+# Least angle of a triangle in the shapes below, degrees: of 20 to 30 none is slender.
 LEAST_ANGLE = 20.0
 
 

@@ -68,8 +68,8 @@ def _check_stretch(body: Body, goal: np.ndarray) -> None:
     sources = np.unique(np.linspace(0, count - 1, min(count, MOST_SOURCES)).round().astype(int))
     reach = _distances_along(body, sources)
     apart = np.linalg.norm(goal[sources][:, None] - goal[None], axis=2)
-    compared = (reach >= SPAN * body.size) & np.isfinite(reach)
-    excess = np.where(compared, apart - MAX_STRETCH * np.where(compared, reach, 0.0), -np.inf)
+    compared = reach >= SPAN * body.size  # infinite between pieces: nothing exceeds that
+    excess = np.where(compared, apart - MAX_STRETCH * reach, -np.inf)
     row, other = np.unravel_index(excess.argmax(), excess.shape)
     if excess[row, other] > NOISE * body.size:
         raise ValueError(

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from jaxsimp.body import Body
 from jaxsimp.garments import Garment
 from jaxsimp.goals.shapes import Positions, flat
-from jaxsimp.meshes import boundary_edges
+from jaxsimp.meshes import boundary_edges, half_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,10 +164,11 @@ def leg_over_leg(trousers: Garment) -> tuple[Fold]:
 def _height_covered(body: Body, folded: np.ndarray, moves: np.ndarray) -> float:
     """Height of the top of what the moved particles cover, metres; 0 for the bare table.
 
-    Something is covered if it is within 3/4 of a spacing of a moved particle seen from above:
-    on a square grid no place is farther than 0.71 from a particle. Where the moved part borders
-    on another, as the corners of a cloth folded to its centre do, it does not cover it:
-    particles on a surface's boundary do not count, if others moved.
+    Something is covered if it is within 3/4 of the usual edge of a moved particle seen from
+    above: on a square grid no place is farther than 0.71 from a particle, on equilateral
+    triangles 0.58. Where the moved part borders on another, as the corners of a cloth folded to
+    its centre do, it does not cover it: particles on a surface's boundary do not count, if
+    others moved.
     """
     from scipy.spatial import cKDTree
 
@@ -177,8 +178,16 @@ def _height_covered(body: Body, folded: np.ndarray, moves: np.ndarray) -> float:
     if not len(still):
         return 0.0
     distance, _ = cKDTree(covering[:, :2]).query(still[:, :2])
-    covered = still[distance <= 0.75 * body.spacing, 2]
+    covered = still[distance <= 0.75 * _usual_edge(body), 2]
     return float(covered.max() + body.radius) if len(covered) else 0.0
+
+
+def _usual_edge(body: Body) -> float:
+    """Median length of the triangles' edges, metres; the spacing of a rope."""
+    if not len(body.faces):
+        return body.spacing
+    first, second = half_edges(body.faces)[0].T
+    return float(np.median(np.linalg.norm(body.rest[second] - body.rest[first], axis=1)))
 
 
 def _fold_about(point: tuple[float, float], direction: tuple[float, float]) -> Fold:

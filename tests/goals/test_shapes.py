@@ -232,6 +232,15 @@ def test_a_rope_that_crosses_itself_is_a_thickness_above_itself(seed):
                 assert above >= 2 * body.radius * (1 - 1e-9)
 
 
+def test_a_rope_that_crosses_itself_at_a_particle_is_lifted_there():
+    line = np.array([[-1, 0], [0, 0], [1, 0], [1, 1], [0, 1], [0, 0], [0, -1]]) * 0.1
+    body = rope(7, 0.6)
+    flat = np.concatenate([line, np.full((7, 1), body.radius)], axis=1)
+    found = goals.lift_crossings(body, flat)
+    assert found[1, 2] == body.radius
+    np.testing.assert_allclose(found[5, 2], 3 * body.radius, rtol=1e-12)
+
+
 def test_a_rope_that_does_not_cross_itself_stays_down():
     body = rope(41, 0.5)
     for found in (goals.letter(body, "M"), goals.straight(body)):
