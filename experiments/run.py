@@ -11,8 +11,9 @@ from typing import ClassVar, Literal
 import tyro
 from rich.console import Console
 
-from experiments import records
+from experiments import records, simplification
 from experiments.plans import ACTION_SPACES, Study, run_study
+from experiments.simplification import available_methods
 from jaxsimp.planning import ENCODINGS
 from jaxsimp.tasks import make_task, task_names
 
@@ -93,26 +94,21 @@ class PlanOptions:
             num_actions=self.num_actions,
         )
 
-    @property
-    def folder(self) -> Path:
-        """Where results go."""
-        return self.out or Path("results") / (f"{self.NAME}-smoke" if self.smoke else self.NAME)
-
     def run(self, console: Console) -> None:
         """Run the study, or list what it can be asked for."""
         if self.list:
             _list(console)
             return
-        study = self.configuration()
-        records.open_folder(self.folder, study.identity())
+        study, folder = self.configuration(), _folder(self)
+        records.open_folder(folder, study.identity())
         # Here, so that --help and wrong options do not wait for matplotlib.
-        from experiments.report import write_report
+        from experiments.plan_report import write_report
 
         start = time.perf_counter()
-        summary = run_study(study, self.folder, console)
-        write_report(study, summary, self.folder)
+        summary = run_study(study, folder, console)
+        write_report(study, summary, folder)
         minutes = (time.perf_counter() - start) / 60
-        console.print(f"done in {minutes:.1f} minutes: {self.folder}/report.md")
+        console.print(f"done in {minutes:.1f} minutes: {folder}/report.md")
 
 
 @dataclass(frozen=True)
@@ -146,10 +142,59 @@ class GoalsOptions(PlanOptions):
     """How CEM encodes what is grasped."""
 
 
-STUDIES: dict[str, type[PlanOptions]] = {
-    options.NAME: options for options in (PaperOptions, GoalsOptions)
+@dataclass(frozen=True)
+class SimplificationOptions:
+    """How often each method finds the right key points of noisy goals.
+
+    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    """
+
+    NAME: ClassVar[str] = "simplification"
+
+    methods: tuple[str, ...] = available_methods()
+    """Methods to compare (default: all, meshlab where its extra is installed)."""
+    seeds: int = 12
+    """Draws of noise for each goal and resolution."""
+    out: Path | None = None
+    """Output folder (default: results/simplification, or results/simplification-smoke)."""
+    smoke: bool = False
+    """One resolution, one seed."""
+
+    def configuration(self) -> simplification.Study:
+        """The study that these options ask for.
+
+        Raises:
+            ValueError: if an option has a value that it cannot have.
+        """
+        return simplification.Study(
+            methods=self.methods,
+            seeds=min(self.seeds, 1) if self.smoke else self.seeds,
+            rope_sizes=(41,) if self.smoke else (41, 81),
+            cloth_sizes=(25,) if self.smoke else (25, 45, 64),
+            settled_size=13 if self.smoke else 25,
+        )
+
+    def run(self, console: Console) -> None:
+        """Run the study."""
+        study, folder = self.configuration(), _folder(self)
+        records.open_folder(folder, study.identity())
+        from experiments.simplification_report import write_report
+
+        write_report(study, simplification.run_study(study, folder, console), folder)
+        console.print(f"done: {folder}/report.md")
+
+
+Options = PlanOptions | SimplificationOptions
+STUDIES: dict[str, type[Options]] = {
+    options.NAME: options for options in (PaperOptions, GoalsOptions, SimplificationOptions)
 }
 """Options of the studies by name; the first one is run where none is named."""
+
+
+def _folder(options: Options) -> Path:
+    """Where results go."""
+    name = f"{options.NAME}-smoke" if options.smoke else options.NAME
+    return options.out or Path("results") / name
 
 
 def main() -> int:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments import report
+from experiments import markdown, plan_report
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from experiments import report
     ],
 )
 def test_success_interval_is_that_of_the_literature(successes, count, low, high):
-    found = report.success_interval(successes, count)
+    found = markdown.success_interval(successes, count)
     assert found == pytest.approx((low, high), abs=5e-5)  # the table has four digits
 
 
@@ -30,7 +30,7 @@ def test_success_interval_is_wilsons_formula(count, data):
     rate, z = successes / count, 1.959963984540054
     middle = (rate + z**2 / (2 * count)) / (1 + z**2 / count)
     half = np.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2)) * z / (1 + z**2 / count)
-    found = report.success_interval(successes, count)
+    found = markdown.success_interval(successes, count)
     assert found == pytest.approx((middle - half, middle + half), abs=1e-9)
     assert 0 <= found[0] <= rate <= found[1] <= 1
 
@@ -56,13 +56,13 @@ def test_the_plan_shown_is_the_median_one_of_the_first_method():
     scores = [0.3, 0.9, None, 0.5, 0.7]
     rows = [row(seed, score) for seed, score in enumerate(scores)]
     rows += [row(seed, -seed, "all_particles") for seed in range(5)]
-    assert report._typical_seed(rows) == 3  # None is worst of all: 0.5 is in the middle
+    assert plan_report._typical_seed(rows) == 3  # None is worst of all: 0.5 is in the middle
 
 
 def test_run_table_summarises_each_method():
     rows = [row(seed, score) for seed, score in enumerate([0.95, 0.2, 0.91])]
     rows += [row(0, None, "all_particles", non_finite=8, cost_per_iteration=[None, None])]
-    table = report._run_table(rows)
+    table = plan_report._run_table(rows)
     assert len(table) == 4
     first = [cell.strip() for cell in table[2].strip("|").split("|")]
     assert first[:3] == ["t", "key points, categorical", "0.910 (0.200 to 0.950)"]
@@ -75,6 +75,6 @@ def test_run_table_summarises_each_method():
 
 def test_costs_have_a_row_a_run_and_nothing_finite_is_not_a_number():
     rows = [row(0, 0.1), row(1, None, cost_per_iteration=[None, 3.0])]
-    ((name, costs),) = report._costs(rows).items()
+    ((name, costs),) = plan_report._costs(rows).items()
     assert name == "key points, categorical"
     np.testing.assert_array_equal(costs, [[2.0, 1.0], [np.nan, 3.0]])

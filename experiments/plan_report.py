@@ -1,19 +1,19 @@
 """What a study of plans leaves behind: summary.json, figures, and a report that shows them."""
 
 from collections import defaultdict
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.plans import PLANS_FOLDER, Study, key_points
+from experiments.markdown import provenance, save_figure, success_interval, table
+from experiments.plans import PLANS_FOLDER, ROWS_FILE, Study, key_points
 from experiments.records import write_json
 from jaxsimp import viz
 from jaxsimp.planning import load_plan
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 Rows = list[dict[str, Any]]
 LABELS = {
@@ -32,10 +32,10 @@ def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     tasks = {name: study.task(name) for name in study.tasks}
     models = {name: key_points(study, name) for name in tasks}
     rows = summary["runs"]
-    _save(viz.plot_model_errors(models), figures / "model_errors.png")
+    save_figure(viz.plot_model_errors(models), figures / "model_errors.png")
     shown = {name: (task.body, task.goal, models[name]) for name, task in tasks.items()}
-    _save(viz.plot_models(shown), figures / "models.png")
-    _save(
+    save_figure(viz.plot_models(shown), figures / "models.png")
+    save_figure(
         viz.plot_costs({name: _costs(_of(rows, task=name)) for name in tasks}),
         figures / "costs.png",
     )
@@ -44,15 +44,8 @@ def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
         seed = _typical_seed(_of(rows, task=name))
         goal = np.asarray(task.episode_fn(seed).goal)
         figure = viz.plot_executions(task.body, goal, plans, name)
-        _save(figure, figures / f"plans_{name}.png")
+        save_figure(figure, figures / f"plans_{name}.png")
     (folder / "report.md").write_text(_report(study, summary))
-
-
-def _save(figure: "Figure", path: Path) -> None:
-    import matplotlib.pyplot as plt
-
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
 
 
 def _of(rows: Rows, **fields: Any) -> Rows:
@@ -95,14 +88,6 @@ def _typical_plans(rows: Rows, folder: Path) -> dict[str, tuple[np.ndarray, floa
     }
 
 
-def success_interval(successes: int, count: int) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a success rate."""
-    from scipy import stats
-
-    found = stats.binomtest(successes, count).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)
-
-
 def _report(study: Study, summary: dict[str, Any]) -> str:
     lines = [
         f"# Goal-conditioned model simplification: the study {study.name!r}",
@@ -128,21 +113,13 @@ def _report(study: Study, summary: dict[str, Any]) -> str:
         "For each task the seed whose score is the median of the first method.",
         *(f"![plans](figures/plans_{name}.png)" for name in study.tasks),
         "",
-        *_provenance(summary["environment"]),
+        *provenance(summary["environment"], f"Rows in `{ROWS_FILE}`, plans in `{PLANS_FOLDER}/`"),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> list[str]:
-    header = list(header)
-    return [
-        "| " + " | ".join(map(str, cells)) + " |"
-        for cells in [header, ["---"] * len(header), *rows]
-    ]
-
-
 def _model_table(models: list[dict[str, Any]]) -> list[str]:
-    return _table(
+    return table(
         ["task", "key points", "particles", "model error (mm)", "threshold (mm)", "method"],
         (
             [
@@ -182,7 +159,7 @@ def _run_table(rows: Rows) -> list[str]:
                     f"{sum(run['compile_seconds'] for run in runs):.1f}",
                 ]
             )
-    return _table(
+    return table(
         [
             "task",
             "method",
@@ -195,13 +172,3 @@ def _run_table(rows: Rows) -> list[str]:
         ],
         table,
     )
-
-
-def _provenance(environment: dict[str, Any]) -> list[str]:
-    versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
-    return [
-        "## Provenance",
-        f"Commit `{environment['commit']}`; Python {environment['python']}; {versions}; "
-        f"{environment['processor']}, {environment['cores']} cores; {environment['platform']}. "
-        f"Rows in `runs.jsonl`, plans in `{PLANS_FOLDER}/`, settings in `config.json`.",
-    ]

@@ -1,0 +1,199 @@
+"""The study of simplification: how often each method finds the right key points of noisy goals.
+
+A goal is right when its key points are as many as the true ones and each is within one and a half
+spacings of its own. Goals are ideal ones with noise (see ideal_goals.py), and settled states of
+our dynamics after a scripted fold.
+"""
+
+import importlib.util
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from experiments import records
+from experiments.ideal_goals import (
+    FOLDS,
+    LINES,
+    NOISES,
+    SETTLED_FOLDS,
+    IdealGoal,
+    add_noise,
+    ideal_goal,
+    ideal_line,
+    is_right,
+    settled_goal,
+)
+from jaxsimp.body import Body, cloth, rope
+from jaxsimp.simplify import METHODS, simplify_batch
+
+ROWS_FILE = "goals.jsonl"
+ROPE_LENGTH = 1.0
+ROPE_LEVELS, CLOTH_LEVELS = (0.001, 0.002, 0.004), (0.0005, 0.001, 0.002)
+"""Levels of noise, metres: on a rope of 1 m and a cloth of 0.3 m."""
+LARGEST_GAP = 0.01
+"""Gaps of layers are drawn from 0 to this, metres."""
+ROUNDINGS = (0.0, 0.004)
+"""Lateral radii of creases, metres."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """One configuration of the study.
+
+    Attributes:
+        methods: of simplification.
+        seeds: draws of noise, gap and rounding for each goal and resolution.
+        rope_sizes: particles along the ropes.
+        cloth_sizes: particles along a side of the cloths.
+        settled_size: particles along a side of the cloths that are settled.
+    """
+
+    methods: tuple[str, ...]
+    seeds: int
+    rope_sizes: tuple[int, ...]
+    cloth_sizes: tuple[int, ...]
+    settled_size: int
+
+    def __post_init__(self) -> None:
+        for name in self.methods:
+            if name not in METHODS:
+                raise ValueError(f"unknown method {name!r}; choose from {', '.join(METHODS)}")
+        if not self.methods:
+            raise ValueError(f"no method is given; choose from {', '.join(METHODS)}")
+        if self.seeds < 1:
+            raise ValueError(f"seeds is {self.seeds}; at least 1 is needed")
+
+    def identity(self) -> dict[str, Any]:
+        """What two folders of results must share."""
+        return asdict(self)
+
+    def cases(self) -> Iterator["Case"]:
+        """Every goal of the study."""
+        sizes = {"rope": self.rope_sizes, "cloth": self.cloth_sizes}
+        for kind, names in (("rope", LINES), ("cloth", FOLDS)):
+            for size in sizes[kind]:
+                for index, name in enumerate(names):
+                    for seed in range(self.seeds):
+                        yield _drawn(kind, name, size, index, seed)
+        for name in SETTLED_FOLDS:
+            for seed in range(self.seeds):
+                yield Case("settled", name, self.settled_size, "none", 0.0, 0.0, 0.0, seed)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A goal to simplify.
+
+    Attributes:
+        kind: "rope", "cloth", or "settled" for the settled state of a cloth.
+        name: of the shape or the fold.
+        size: particles along the rope or along a side.
+        noise: its kind.
+        level: of the noise, metres.
+        gap: of layers, metres.
+        rounding: radius of corners or creases, metres.
+        seed: of the noise.
+    """
+
+    kind: str
+    name: str
+    size: int
+    noise: str
+    level: float
+    gap: float
+    rounding: float
+    seed: int
+
+    def make(self) -> IdealGoal:
+        """The goal, with its noise."""
+        body = make_body(self.kind, self.size)
+        if self.kind == "settled":
+            return settled_goal(body, self.name, self.seed)
+        if self.kind == "rope":
+            ideal = ideal_line(body, self.name, rounding=self.rounding)
+        else:
+            ideal = ideal_goal(body, self.name, gap=self.gap, rounding=self.rounding)
+        return add_noise(ideal, self.noise, self.level, self.seed)
+
+
+@cache
+def make_body(kind: str, size: int) -> Body:
+    """The body of a case."""
+    return rope(size, ROPE_LENGTH) if kind == "rope" else cloth((size, size))
+
+
+def _drawn(kind: str, name: str, size: int, index: int, seed: int) -> Case:
+    """A case whose noise goes through all kinds and levels, and whose gap is drawn at random."""
+    levels = ROPE_LEVELS if kind == "rope" else CLOTH_LEVELS
+    # Neighbouring goals and seeds get other combinations, so that few seeds see all of them.
+    turn = seed + index
+    rng = np.random.default_rng([size, index, seed])
+    return Case(
+        kind=kind,
+        name=name,
+        size=size,
+        noise=tuple(NOISES)[turn % len(NOISES)],
+        level=levels[(turn // len(NOISES) + seed) % len(levels)],
+        gap=float(rng.uniform(0.0, LARGEST_GAP)) if kind == "cloth" else 0.0,
+        rounding=ROUNDINGS[(seed // 2) % 2],
+        seed=seed,
+    )
+
+
+def available_methods() -> tuple[str, ...]:
+    """All methods of simplification, but for those whose extra is not installed."""
+    missing = () if importlib.util.find_spec("pymeshlab") else ("meshlab",)
+    return tuple(name for name in METHODS if name not in missing)
+
+
+def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+    """Simplify what is not in the folder yet, and return the summary of everything in it."""
+    path = folder / ROWS_FILE
+    done = {_identity(row) for row in records.read_rows(path)}
+    cases = list(study.cases())
+    left = [
+        case
+        for case in cases
+        if not all((*asdict(case).values(), m) in done for m in study.methods)
+    ]
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        for case, method in progress.track(left, description="goals"):
+            records.append_row(path, _row(case, case.make(), method))
+    order = {(*asdict(case).values(), m): i for i, case in enumerate(cases) for m in study.methods}
+    rows = sorted(records.read_rows(path), key=lambda row: order[_identity(row)])
+    return {"environment": records.environment(), "goals": rows}
+
+
+def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
+    (found,) = simplify_batch(ideal.body, ideal.goal[None], method=method)
+    return {
+        **asdict(case),
+        "method": method,
+        "right": is_right(found, ideal),
+        "status": found.status.name,
+        "key_points": found.particles.tolist(),
+        "num_key_points": len(found),
+        "num_true": len(ideal.true_points),
+        "certified": found.certified,
+        "sizes": list(found.sizes),
+        "errors": [error if np.isfinite(error) else None for error in found.errors],
+        "max_error": found.max_error if np.isfinite(found.max_error) else None,
+        "tolerance": found.tolerance,
+    }
+
+
+def _identity(row: dict[str, Any]) -> tuple[Any, ...]:
+    fields = ("kind", "name", "size", "noise", "level", "gap", "rounding", "seed", "method")
+    return tuple(row[name] for name in fields)
