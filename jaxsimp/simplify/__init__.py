@@ -1,7 +1,9 @@
 """Simplification: a goal configuration to the key points that matter for it."""
 
 from jaxsimp.body import Body
-from jaxsimp.goals import Positions
+from jaxsimp.goals import Positions, check_goal
+from jaxsimp.simplify.cloth_meshlab import simplify_meshlab
+from jaxsimp.simplify.cloth_parametric import simplify_parametric
 from jaxsimp.simplify.cloth_quadric import simplify_quadric
 from jaxsimp.simplify.keypoints import KeyPoints
 from jaxsimp.simplify.rope_uniform import simplify_uniform
@@ -9,7 +11,11 @@ from jaxsimp.simplify.rope_uniform import simplify_uniform
 __all__ = ["KeyPoints", "simplify", "simplify_quadric", "simplify_uniform"]
 
 # A method is one function for ropes and one for surfaces.
-METHODS = {"paper": (simplify_uniform, simplify_quadric)}
+METHODS = {
+    "robust": (simplify_uniform, simplify_parametric),
+    "paper": (simplify_uniform, simplify_quadric),
+    "meshlab": (simplify_uniform, simplify_meshlab),
+}
 
 
 def simplify(
@@ -36,6 +42,7 @@ def simplify(
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}")
-    simplify_body = METHODS[method][len(body.faces) > 0]
+    if len(body.faces):
+        return METHODS[method][1](body, check_goal(body, goal)[None], tolerance, max_size)[0]
     options = {} if max_size is None else {"max_size": max_size}
-    return simplify_body(body, goal, tolerance=tolerance, **options)
+    return simplify_uniform(body, goal, tolerance=tolerance, **options)

@@ -1,0 +1,184 @@
+"""Surfaces: the fewest triangles, in rest coordinates, that take every particle to its goal.
+
+Rest-aware collapse. A quadric edge collapse in goal and rest coordinates together leaves about
+two dozen vertices, all of them particles. Then vertices are removed one by one, and the others
+moved to neighbouring particles and edges flipped, while a least-squares fit of the model to
+all particles gets better. The fit averages over noise; layers that lie on each other are far
+apart at rest, so they are never mistaken for one.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsimp.body import Body
+from jaxsimp.goals import Positions
+from jaxsimp.simplify.cloth_common import (
+    DEFAULT_MAX_SIZE,
+    boundary,
+    check_options,
+    no_model,
+    rest_areas,
+)
+from jaxsimp.simplify.keypoints import KeyPoints, Status, smallest_fit
+
+if TYPE_CHECKING:
+    from jaxsimp.simplify.refine_kernels import Model, Sheet
+
+METHOD = "rest-aware collapse"
+MIN_SIZE = 3  # one triangle
+START_SIZE = 24  # vertices that the collapse leaves, at least
+TOLERANCE = 0.1  # of the side of a square of the body's area
+# Removals whose largest distance is below this part of the tolerance are compared by their mean
+# square distance alone: the largest of many small distances is noise.
+ENOUGH = 0.5
+LONGEST_MOVE = 1 / 6  # of the particles along a side
+
+
+def simplify_parametric(
+    body: Body,
+    goals: Float[np.ndarray, "B N 3"],
+    tolerance: float | None = None,
+    max_size: int | None = None,
+) -> list[KeyPoints]:
+    """Key points of goals of a surface: the fewest whose model is near every particle.
+
+    The error of a model is the largest distance of a particle's goal from the piecewise-linear
+    interpolation, at the particle's rest coordinates, of the key points' positions. These are a
+    least-squares fit to all particles, weighted by their area, and not the goals of the key
+    particles: a fit averages over noise. No model is proven to be the smallest.
+
+    Works for any manifold with or without boundary, planar at rest or not. Goals are
+    independent of each other and run in threads. The first call compiles for about half a
+    minute; the result is kept on disk.
+
+    Args:
+        body: a body with triangles; particles of none are left out of account.
+        goals: goal positions, shape (B, N, 3), metres.
+        tolerance: error below which a model fits, metres; by default a tenth of the side of a
+            square that is as large as the body.
+        max_size: largest number of key points tried; 24 by default.
+
+    Returns:
+        Key points of each goal. Where no model of up to `max_size` key points fits the status is
+        `NO_FIT` and it is the best of them.
+
+    Raises:
+        ValueError: if the body has no triangles, the tolerance is not above zero, or
+            `max_size` is below 3.
+    """
+    scale = float(np.sqrt(rest_areas(body.rest, body.faces).sum()))
+    tolerance = TOLERANCE * scale if tolerance is None else tolerance
+    max_size = DEFAULT_MAX_SIZE if max_size is None else max_size
+    check_options(body, tolerance, max_size, MIN_SIZE)
+
+    def one(goal: np.ndarray) -> KeyPoints:
+        sheet = _sheet(body, goal, scale)
+        models = _models(sheet, body.faces, max(max_size, START_SIZE), tolerance / scale)
+        models = {size: model for size, model in models.items() if size <= max_size}
+        return _smallest(body, goal, sheet, models, scale, tolerance)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(one, goals))
+
+
+def _sheet(body: Body, goal: Positions, scale: float) -> "Sheet":
+    """Body and goal as the compiled functions take them, in lengths of `scale`."""
+    from jaxsimp.simplify.refine_kernels import Sheet
+
+    count, faces = body.num_particles, body.faces
+    area = np.zeros(count)
+    np.add.at(area, faces, rest_areas(body.rest, faces)[:, None] / 3)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    used = area > 0
+    return Sheet(
+        rest=(body.rest - body.rest[used].mean(axis=0)) / scale,
+        goal=(goal - goal[used].mean(axis=0)) / scale,
+        area=area / area.sum(),
+        first=np.searchsorted(edges[:, 0], np.arange(count + 1)),
+        other=np.ascontiguousarray(edges[:, 1]),
+        rim=_rim(faces, count),
+    )
+
+
+def _rim(faces: Int[np.ndarray, "F 3"], count: int) -> Int[np.ndarray, "N 2"]:
+    """The two neighbours of each vertex along the boundary, -1 where it is not on it."""
+    edges, _ = boundary(faces)
+    both = np.concatenate([edges, edges[:, ::-1]])
+    both = both[np.lexsort(both.T[::-1])]
+    rim = np.full((count, 2), -1)
+    # Written forwards the last neighbour stays, backwards the first.
+    rim[both[:, 0], 1] = both[:, 1]
+    rim[both[::-1, 0], 0] = both[::-1, 1]
+    return rim
+
+
+def _models(
+    sheet: "Sheet", faces: Int[np.ndarray, "F 3"], size: int, tolerance: float
+) -> dict[int, "Model"]:
+    """Models of all sizes, by size: from `size`, where the mesh has as many, down."""
+    from jaxsimp.simplify import collapse_kernels, refine_kernels
+
+    edges, owner = boundary(faces)
+    rims = np.column_stack([edges, faces[owner].sum(axis=1) - edges.sum(axis=1)])
+    points = np.concatenate([sheet.goal, sheet.rest], axis=1)
+    faces = np.array(faces, dtype=np.int64)
+    left = collapse_kernels.decimate(points, sheet.rest, faces, rims, size)
+    model = refine_kernels.start(sheet, *left)
+    steps = _steps(len(sheet.rest))
+    near = np.ones(len(model.vertices), dtype=bool)
+    models: dict[int, Model] = {}
+    while len(model.vertices) not in models:
+        model = refine_kernels.improve(sheet, model, near, steps)
+        models[len(model.vertices)] = model
+        model, near = refine_kernels.remove(sheet, model, ENOUGH * tolerance)
+    return models
+
+
+def _steps(num_particles: int) -> Int[np.ndarray, " L"]:
+    """Lengths of moves in particles, longest first: powers of two."""
+    longest = max(1.0, LONGEST_MOVE * np.sqrt(num_particles))
+    return 2 ** np.arange(int(np.log2(longest)), -1, -1)
+
+
+def _smallest(
+    body: Body,
+    goal: Positions,
+    sheet: "Sheet",
+    models: dict[int, "Model"],
+    scale: float,
+    tolerance: float,
+) -> KeyPoints:
+    """The smallest model that fits, or the best."""
+    from jaxsimp.simplify.refine_kernels import distances, fit
+
+    def error(size: int) -> float:
+        positions, _ = fit(sheet, models[size])
+        return float(scale * distances(sheet, models[size], positions).max())
+
+    size, errors = smallest_fit(error, sorted(models), tolerance)
+    if not errors:
+        return no_model(body, tolerance, METHOD)
+    best = min(errors, key=errors.__getitem__) if size is None else size
+    model = models[best]
+    positions, _ = fit(sheet, model)
+    off = scale * distances(sheet, model, positions)[model.owner >= 0]
+    order = np.argsort(model.vertices)
+    used = sheet.area > 0
+    return KeyPoints(
+        particles=model.vertices[order],
+        positions=scale * positions[order] + goal[used].mean(axis=0),
+        elements=np.argsort(order)[model.triangles],
+        num_particles=body.num_particles,
+        method=METHOD,
+        sizes=tuple(errors),
+        errors=tuple(errors.values()),
+        tolerance=tolerance,
+        max_error=float(off.max()),
+        rms_error=float(np.sqrt(np.mean(off**2))),
+        status=Status.NO_FIT if size is None else Status.FITS,
+    )

@@ -1,0 +1,341 @@
+"""Compiled: quadric edge collapse in goal and rest coordinates together.
+
+Quadrics in more than three dimensions: Garland & Heckbert, "Simplifying surfaces with color
+and texture using quadric error metrics", 1998. With the rest coordinates among them layers
+that coincide in the goal stay apart, and noise cannot turn a triangle over unseen.
+"""
+
+import heapq
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+DIMENSIONS = 6  # goal x, y, z and rest x, y, z
+BOUNDARY_WEIGHT = 10.0  # of a boundary edge, times its squared length; a triangle weighs its area
+LEAST_HEIGHT = 1e-3  # of a triangle at rest, relative to its longest edge
+LENGTH_WEIGHT = 1e-9  # of an edge's squared length in its price: decides where quadrics are zero
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh under decimation; arrays change in place.
+
+    Corner `c` of triangle `f` is number `3 f + c`; the corners of a vertex are a linked list, and
+    so are the particles of a triangle. A triangle that is gone has vertices -1.
+    """
+
+    rest: np.ndarray  # (N, 3)
+    triangles: np.ndarray  # (F, 3)
+    first_corner: np.ndarray  # (N,)
+    next_corner: np.ndarray  # (3 F,)
+    first_particle: np.ndarray  # (F,)
+    next_particle: np.ndarray  # (N,)
+
+
+@njit(cache=True, nogil=True)
+def decimate(points, rest, faces, rims, size):
+    """Collapse edges until `size` vertices are left, or no collapse is sound.
+
+    Args:
+        points: goal and rest coordinates, shape (N, 6), scaled alike.
+        rest: rest coordinates, shape (N, 3).
+        faces: particle ids of the triangles, shape (F, 3), consistently oriented.
+        rims: ends of each boundary edge and the third vertex of its triangle, shape (E, 3).
+        size: number of vertices at which to stop.
+
+    Returns:
+        Triangles that are left, shape (M, 3), and the one that covers each particle at rest,
+        shape (N,); -1 for a particle of no triangle.
+    """
+    mesh = linked(rest, faces)
+    quadrics = all_quadrics(points, faces, rims)
+    stamps = np.zeros(len(rest), dtype=np.int64)
+    queue = [(0.0, -1, -1, 0, 0)]
+    left = 0
+    for vertex in range(len(rest)):
+        around = star(mesh, vertex)
+        left += len(around) > 0
+        offer(queue, mesh, points, quadrics, stamps, vertex, around)
+    while left > size and len(queue) > 0:
+        _, gone, kept, stamp_gone, stamp_kept = heapq.heappop(queue)
+        if gone < 0 or stamps[gone] != stamp_gone or stamps[kept] != stamp_kept:
+            continue
+        if not (links(mesh, gone, kept) and keeps_sound(mesh, gone, kept)):
+            continue
+        collapse(mesh, gone, kept)
+        quadrics[kept] += quadrics[gone]
+        stamps[gone] = -1
+        left -= 1
+        around = star(mesh, kept)
+        changed = ring(mesh, kept, around)
+        changed.append(kept)
+        for vertex in changed:
+            stamps[vertex] += 1
+        for vertex in changed:
+            offer(queue, mesh, points, quadrics, stamps, vertex, star(mesh, vertex))
+    return survivors(mesh)
+
+
+@njit(cache=True, nogil=True)
+def linked(rest, faces):
+    """The mesh with its linked lists; each particle is in one triangle that it is a corner of."""
+    first_corner = np.full(len(rest), -1, dtype=np.int64)
+    next_corner = np.full(3 * len(faces), -1, dtype=np.int64)
+    first_particle = np.full(len(faces), -1, dtype=np.int64)
+    next_particle = np.full(len(rest), -1, dtype=np.int64)
+    for face in range(len(faces)):
+        for c in range(3):
+            vertex = faces[face, c]
+            if first_corner[vertex] < 0:
+                next_particle[vertex] = first_particle[face]
+                first_particle[face] = vertex
+            next_corner[3 * face + c] = first_corner[vertex]
+            first_corner[vertex] = 3 * face + c
+    return Mesh(rest, faces.copy(), first_corner, next_corner, first_particle, next_particle)
+
+
+@njit(cache=True, nogil=True)
+def all_quadrics(points, faces, rims):
+    """Quadric of each vertex, shape (N, 7, 7): of its triangles and its boundary edges."""
+    quadrics = np.zeros((len(points), DIMENSIONS + 1, DIMENSIONS + 1))
+    for face in faces:
+        along, across, length, height = frame(points[face[0]], points[face[1]], points[face[2]])
+        plane = np.eye(DIMENSIONS) - np.outer(along, along) - np.outer(across, across)
+        add_quadric(quadrics, face, points[face[0]], plane * (length * height / 2))
+    for rim in rims:
+        _, across, length, _ = frame(points[rim[0]], points[rim[1]], points[rim[2]])
+        plane = np.outer(across, across) * (BOUNDARY_WEIGHT * length**2)
+        add_quadric(quadrics, rim[:2], points[rim[0]], plane)
+    return quadrics
+
+
+@njit(cache=True, nogil=True)
+def frame(a, b, c):
+    """Orthonormal directions of a triangle, along and across the edge ab; length and height."""
+    along = b - a
+    length = np.sqrt(np.sum(along**2))
+    along = along / max(length, 1e-300)
+    across = (c - a) - np.sum((c - a) * along) * along
+    height = np.sqrt(np.sum(across**2))
+    return along, across / max(height, 1e-300), length, height
+
+
+@njit(cache=True, nogil=True)
+def add_quadric(quadrics, vertices, origin, plane):
+    """Add the squared distance (x - origin)' plane (x - origin) to the quadrics of vertices."""
+    offset = np.zeros(DIMENSIONS)
+    for i in range(DIMENSIONS):
+        offset[i] = -np.sum(plane[i] * origin)
+    for vertex in vertices:
+        quadrics[vertex, :DIMENSIONS, :DIMENSIONS] += plane
+        quadrics[vertex, :DIMENSIONS, DIMENSIONS] += offset
+        quadrics[vertex, DIMENSIONS, :DIMENSIONS] += offset
+        quadrics[vertex, DIMENSIONS, DIMENSIONS] -= np.sum(offset * origin)
+
+
+@njit(cache=True, nogil=True)
+def offer(queue, mesh, points, quadrics, stamps, vertex, around):
+    """Put the collapses of all edges at a vertex, both ways, into the queue."""
+    for other in ring(mesh, vertex, around):
+        length = np.sum((points[vertex] - points[other]) ** 2)
+        for gone, kept in ((vertex, other), (other, vertex)):
+            price = max(0.0, price_at(quadrics[gone], quadrics[kept], points[kept]))
+            price += LENGTH_WEIGHT * length
+            heapq.heappush(queue, (price, gone, kept, stamps[gone], stamps[kept]))
+
+
+@njit(cache=True, nogil=True)
+def price_at(first, second, point):
+    """The sum of two quadrics at a point."""
+    total = first[DIMENSIONS, DIMENSIONS] + second[DIMENSIONS, DIMENSIONS]
+    for i in range(DIMENSIONS):
+        row = 2 * (first[i, DIMENSIONS] + second[i, DIMENSIONS])
+        for j in range(DIMENSIONS):
+            row += (first[i, j] + second[i, j]) * point[j]
+        total += row * point[i]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def star(mesh, vertex):
+    """Triangles at a vertex."""
+    around = [0][:0]
+    corner = mesh.first_corner[vertex]
+    while corner >= 0:
+        if mesh.triangles[corner // 3, 0] >= 0:
+            around.append(corner // 3)
+        corner = mesh.next_corner[corner]
+    return around
+
+
+@njit(cache=True, nogil=True)
+def ring(mesh, vertex, around):
+    """Neighbours of a vertex, given the triangles at it."""
+    others = [0][:0]
+    for triangle in around:
+        for c in range(3):
+            other = mesh.triangles[triangle, c]
+            if other != vertex and other not in others:
+                others.append(other)
+    return others
+
+
+@njit(cache=True, nogil=True)
+def links(mesh, gone, kept):
+    """The collapse leaves a surface of the same topology, and no boundary vertex inside."""
+    around_gone, around_kept = star(mesh, gone), star(mesh, kept)
+    ring_gone, ring_kept = ring(mesh, gone, around_gone), ring(mesh, kept, around_kept)
+    shared = 0
+    for triangle in around_gone:
+        shared += triangle in around_kept
+    common = 0
+    for other in ring_gone:
+        if other in ring_kept:
+            common += 1
+            if len(star(mesh, other)) == 3 and len(ring(mesh, other, star(mesh, other))) == 3:
+                return False  # it would be left with two triangles, back to back
+    # A vertex of the boundary stays on it: it may only move along an edge of one triangle.
+    on_rim = len(ring_gone) != len(around_gone)
+    return common == shared and (shared == 1 or not on_rim)
+
+
+@njit(cache=True, nogil=True)
+def keeps_sound(mesh, gone, kept):
+    """The collapse leaves triangles, none of them degenerate or turned over at rest."""
+    moving = 0
+    for triangle in star(mesh, gone):
+        a, b, c = mesh.triangles[triangle]
+        if kept in (a, b, c):
+            continue
+        moving += 1
+        old, _ = normal_at(mesh.rest, a, b, c)
+        a, b, c = kept if a == gone else a, kept if b == gone else b, kept if c == gone else c
+        if not is_sound(mesh.rest, a, b, c, old):
+            return False
+    return moving > 0
+
+
+@njit(cache=True, nogil=True)
+def normal_at(rest, a, b, c):
+    """Normal of a triangle, twice its area long, and its longest edge squared."""
+    x, y, z = rest[b] - rest[a], rest[c] - rest[a], rest[c] - rest[b]
+    normal = np.array(
+        [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
+    )
+    return normal, max(np.sum(x**2), np.sum(y**2), np.sum(z**2))
+
+
+@njit(cache=True, nogil=True)
+def is_sound(rest, a, b, c, reference):
+    """A triangle has some height at rest, and looks where the reference looks."""
+    normal, longest = normal_at(rest, a, b, c)
+    wide = np.sum(normal**2) > (LEAST_HEIGHT * longest) ** 2
+    return wide and np.sum(normal * reference) > 0
+
+
+@njit(cache=True, nogil=True)
+def collapse(mesh, gone, kept):
+    """Move `gone` onto `kept`, and put the particles around it into the triangles that stay."""
+    around = star(mesh, gone)
+    particles, stay = [0][:0], [0][:0]
+    for triangle in around:
+        particle = mesh.first_particle[triangle]
+        while particle >= 0:
+            particles.append(particle)
+            particle = mesh.next_particle[particle]
+        mesh.first_particle[triangle] = -1
+        corners = mesh.triangles[triangle]
+        if kept in (corners[0], corners[1], corners[2]):
+            corners[:] = -1
+            continue
+        stay.append(triangle)
+        for c in range(3):
+            if corners[c] == gone:
+                corners[c] = kept
+                mesh.next_corner[3 * triangle + c] = -1
+    # The corners that moved go to the front of the list of `kept`.
+    mesh.first_corner[gone] = -1
+    for triangle in stay:
+        for c in range(3):
+            if mesh.triangles[triangle, c] == kept:
+                mesh.next_corner[3 * triangle + c] = mesh.first_corner[kept]
+                mesh.first_corner[kept] = 3 * triangle + c
+    for particle in particles:
+        nearest = nearest_triangle(mesh.rest, particle, mesh.triangles, stay)[0]
+        mesh.next_particle[particle] = mesh.first_particle[nearest]
+        mesh.first_particle[nearest] = particle
+
+
+@njit(cache=True, nogil=True)
+def nearest_triangle(rest, particle, corners, candidates):
+    """Of some triangles the nearest to a particle at rest, and the barycentric coordinates.
+
+    Args:
+        rest: rest coordinates, shape (N, 3).
+        particle: its id.
+        corners: particle ids of all triangles, shape (M, 3).
+        candidates: ids of the triangles to choose from.
+
+    Returns:
+        Triangle id, the coordinates of its point nearest to the particle, and the squared
+        distance of that.
+    """
+    best, least = candidates[0], np.inf
+    weights = (1.0, 0.0, 0.0)
+    for triangle in candidates:
+        a, b, c = corners[triangle]
+        squared, first, second = nearest_point(rest[particle], rest[a], rest[b], rest[c])
+        if squared < least:
+            best, least, weights = triangle, squared, (1.0 - first - second, first, second)
+            if squared < 1e-24:
+                break
+    return best, weights, least
+
+
+@njit(cache=True, nogil=True)
+def nearest_point(p, a, b, c):
+    """Squared distance of a point from a triangle, and coordinates of b and c in the nearest."""
+    e00, e01, e11, d0, d1, pp = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        u, v, w = b[i] - a[i], c[i] - a[i], p[i] - a[i]
+        e00, e01, e11 = e00 + u * u, e01 + u * v, e11 + v * v
+        d0, d1, pp = d0 + u * w, d1 + v * w, pp + w * w
+    determinant = e00 * e11 - e01 * e01
+    s, t = e11 * d0 - e01 * d1, e00 * d1 - e01 * d0
+    if determinant > 0 and s >= 0 and t >= 0 and s + t <= determinant:
+        s, t = s / determinant, t / determinant
+        inside = pp - s * d0 - t * d1
+        return max(inside, 0.0), s, t
+    # Outside: the nearest point is on one of the edges.
+    s = min(max(d0 / e00, 0.0), 1.0) if e00 > 0 else 0.0
+    best, first, second = pp - 2 * s * d0 + s * s * e00, s, 0.0
+    t = min(max(d1 / e11, 0.0), 1.0) if e11 > 0 else 0.0
+    squared = pp - 2 * t * d1 + t * t * e11
+    if squared < best:
+        best, first, second = squared, 0.0, t
+    edge = e00 - 2 * e01 + e11
+    t = min(max((d1 - d0 + e00 - e01) / edge, 0.0), 1.0) if edge > 0 else 0.0
+    s = 1.0 - t
+    squared = pp - 2 * (s * d0 + t * d1) + s * s * e00 + 2 * s * t * e01 + t * t * e11
+    if squared < best:
+        best, first, second = squared, s, t
+    return max(best, 0.0), first, second
+
+
+@njit(cache=True, nogil=True)
+def survivors(mesh):
+    """Triangles that are left, shape (M, 3), and the one of each particle, shape (N,)."""
+    count = np.sum(mesh.triangles[:, 0] >= 0)
+    triangles = np.empty((count, 3), dtype=np.int64)
+    owner = np.full(len(mesh.rest), -1, dtype=np.int64)
+    row = 0
+    for triangle in range(len(mesh.triangles)):
+        if mesh.triangles[triangle, 0] < 0:
+            continue
+        triangles[row] = mesh.triangles[triangle]
+        particle = mesh.first_particle[triangle]
+        while particle >= 0:
+            owner[particle] = row
+            particle = mesh.next_particle[particle]
+        row += 1
+    return triangles, owner
