@@ -35,6 +35,7 @@ TOLERANCE = 0.1  # of the side of a square of the body's area
 # Removals whose largest distance is below this part of the tolerance are compared by their mean
 # square distance alone: the largest of many small distances is noise.
 ENOUGH = 0.5
+BOUNDARY_WEIGHT = 10.0  # of a boundary edge, times its squared length; a triangle weighs its area
 LONGEST_MOVE = 1 / 6  # of the particles along a side
 
 
@@ -123,20 +124,88 @@ def _models(
     """Models of all sizes, by size: from `size`, where the mesh has as many, down."""
     from jaxsimp.simplify import collapse_kernels, refine_kernels
 
-    edges, owner = boundary(faces)
-    rims = np.column_stack([edges, faces[owner].sum(axis=1) - edges.sum(axis=1)])
     points = np.concatenate([sheet.goal, sheet.rest], axis=1)
-    faces = np.array(faces, dtype=np.int64)
-    left = collapse_kernels.decimate(points, sheet.rest, faces, rims, size)
-    model = refine_kernels.start(sheet, *left)
+    quadrics = _quadrics(points, faces)
+    triangles, owner = collapse_kernels.decimate(
+        points, quadrics, sheet.rest, np.array(faces, dtype=np.int64), size
+    )
+    vertices, local = np.unique(triangles, return_inverse=True)
+    model = refine_kernels.start(sheet, vertices, local.reshape(-1, 3), owner)
     steps = _steps(len(sheet.rest))
     near = np.ones(len(model.vertices), dtype=bool)
     models: dict[int, Model] = {}
-    while len(model.vertices) not in models:
+    gone = 0
+    while gone >= 0:
         model = refine_kernels.improve(sheet, model, near, steps)
         models[len(model.vertices)] = model
-        model, near = refine_kernels.remove(sheet, model, ENOUGH * tolerance)
+        smaller, gone = refine_kernels.remove(sheet, model, ENOUGH * tolerance)
+        near = refine_kernels.neighbours(model.triangles, gone) > 0
+        model, near = _without_gaps(smaller), np.delete(near, gone)
     return models
+
+
+def _without_gaps(model: "Model") -> "Model":
+    """The model without the rows of what is gone."""
+    vertices, triangles = model.vertices >= 0, model.triangles[:, 0] >= 0
+    # What refers to nothing, -1, finds the -1 at the end.
+    vertex_number = np.append(np.cumsum(vertices) - 1, -1)
+    triangle_number = np.append(np.cumsum(triangles) - 1, -1)
+    return model._replace(
+        vertices=model.vertices[vertices],
+        triangles=vertex_number[model.triangles[triangles]],
+        owner=triangle_number[model.owner],
+    )
+
+
+def _quadrics(
+    points: Float[np.ndarray, "N 6"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "N 7 7"]:
+    """Squared distances from the planes of each vertex's triangles and boundary edges.
+
+    As functions of a point with a 1 behind it. A triangle's plane counts by its area. An edge of
+    the boundary adds the distance from it within the plane of its triangle.
+    """
+    quadrics = np.zeros((len(points), 7, 7))
+    along, across, area = _frames(points[faces])
+    off = np.eye(6) - along[:, :, None] * along[:, None] - across[:, :, None] * across[:, None]
+    _add_quadrics(quadrics, points, faces, off * area[:, None, None])
+    edges, owner = boundary(faces)
+    apex = faces[owner].sum(axis=1) - edges.sum(axis=1)
+    _, across, _ = _frames(points[np.column_stack([edges, apex])])
+    squared = np.sum((points[edges[:, 1]] - points[edges[:, 0]]) ** 2, axis=1)
+    off = across[:, :, None] * across[:, None] * (BOUNDARY_WEIGHT * squared)[:, None, None]
+    _add_quadrics(quadrics, points, edges, off)
+    return quadrics
+
+
+def _frames(
+    corners: Float[np.ndarray, "M 3 D"],
+) -> tuple[Float[np.ndarray, "M D"], Float[np.ndarray, "M D"], Float[np.ndarray, " M"]]:
+    """Orthonormal directions along and across the first edge of triangles, and their areas."""
+    edge, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    tiny = np.finfo(float).tiny
+    length = np.linalg.norm(edge, axis=1, keepdims=True)
+    along = edge / np.maximum(length, tiny)
+    rise = other - np.sum(other * along, axis=1, keepdims=True) * along
+    height = np.linalg.norm(rise, axis=1, keepdims=True)
+    return along, rise / np.maximum(height, tiny), (length * height)[:, 0] / 2
+
+
+def _add_quadrics(
+    quadrics: Float[np.ndarray, "N 7 7"],
+    points: Float[np.ndarray, "N 6"],
+    simplices: Int[np.ndarray, "M _"],
+    matrices: Float[np.ndarray, "M 6 6"],
+) -> None:
+    """Add (x - p)' A (x - p) to every vertex of each simplex, p its first vertex."""
+    origin = points[simplices[:, 0]]
+    whole = np.zeros((len(simplices), 7, 7))
+    offset = -np.einsum("mij,mj->mi", matrices, origin)
+    whole[:, :6, :6] = matrices
+    whole[:, :6, 6] = whole[:, 6, :6] = offset
+    whole[:, 6, 6] = -np.sum(offset * origin, axis=1)
+    for vertices in simplices.T:
+        np.add.at(quadrics, vertices, whole)
 
 
 def _steps(num_particles: int) -> Int[np.ndarray, " L"]:

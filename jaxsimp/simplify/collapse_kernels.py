@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 
 DIMENSIONS = 6  # goal x, y, z and rest x, y, z
-BOUNDARY_WEIGHT = 10.0  # of a boundary edge, times its squared length; a triangle weighs its area
 LEAST_HEIGHT = 1e-3  # of a triangle at rest, relative to its longest edge
+THIN = 1e-6  # sine of an angle that is as good as none
 LENGTH_WEIGHT = 1e-9  # of an edge's squared length in its price: decides where quadrics are zero
 
 
@@ -33,14 +33,15 @@ class Mesh(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def decimate(points, rest, faces, rims, size):
+def decimate(points, quadrics, rest, faces, size):
     """Collapse edges until `size` vertices are left, or no collapse is sound.
 
     Args:
         points: goal and rest coordinates, shape (N, 6), scaled alike.
+        quadrics: squared distances that each vertex stands for, as functions of a point with a
+            1 behind it, shape (N, 7, 7); changed in place.
         rest: rest coordinates, shape (N, 3).
         faces: particle ids of the triangles, shape (F, 3), consistently oriented.
-        rims: ends of each boundary edge and the third vertex of its triangle, shape (E, 3).
         size: number of vertices at which to stop.
 
     Returns:
@@ -48,7 +49,6 @@ def decimate(points, rest, faces, rims, size):
         shape (N,); -1 for a particle of no triangle.
     """
     mesh = linked(rest, faces)
-    quadrics = all_quadrics(points, faces, rims)
     stamps = np.zeros(len(rest), dtype=np.int64)
     queue = [(0.0, -1, -1, 0, 0)]
     left = 0
@@ -63,7 +63,7 @@ def decimate(points, rest, faces, rims, size):
         if not (links(mesh, gone, kept) and keeps_sound(mesh, gone, kept)):
             continue
         collapse(mesh, gone, kept)
-        quadrics[kept] += quadrics[gone]
+        add_to(quadrics[kept], quadrics[gone])
         stamps[gone] = -1
         left -= 1
         around = star(mesh, kept)
@@ -95,53 +95,24 @@ def linked(rest, faces):
 
 
 @njit(cache=True, nogil=True)
-def all_quadrics(points, faces, rims):
-    """Quadric of each vertex, shape (N, 7, 7): of its triangles and its boundary edges."""
-    quadrics = np.zeros((len(points), DIMENSIONS + 1, DIMENSIONS + 1))
-    for face in faces:
-        along, across, length, height = frame(points[face[0]], points[face[1]], points[face[2]])
-        plane = np.eye(DIMENSIONS) - np.outer(along, along) - np.outer(across, across)
-        add_quadric(quadrics, face, points[face[0]], plane * (length * height / 2))
-    for rim in rims:
-        _, across, length, _ = frame(points[rim[0]], points[rim[1]], points[rim[2]])
-        plane = np.outer(across, across) * (BOUNDARY_WEIGHT * length**2)
-        add_quadric(quadrics, rim[:2], points[rim[0]], plane)
-    return quadrics
-
-
-@njit(cache=True, nogil=True)
-def frame(a, b, c):
-    """Orthonormal directions of a triangle, along and across the edge ab; length and height."""
-    along = b - a
-    length = np.sqrt(np.sum(along**2))
-    along = along / max(length, 1e-300)
-    across = (c - a) - np.sum((c - a) * along) * along
-    height = np.sqrt(np.sum(across**2))
-    return along, across / max(height, 1e-300), length, height
-
-
-@njit(cache=True, nogil=True)
-def add_quadric(quadrics, vertices, origin, plane):
-    """Add the squared distance (x - origin)' plane (x - origin) to the quadrics of vertices."""
-    offset = np.zeros(DIMENSIONS)
-    for i in range(DIMENSIONS):
-        offset[i] = -np.sum(plane[i] * origin)
-    for vertex in vertices:
-        quadrics[vertex, :DIMENSIONS, :DIMENSIONS] += plane
-        quadrics[vertex, :DIMENSIONS, DIMENSIONS] += offset
-        quadrics[vertex, DIMENSIONS, :DIMENSIONS] += offset
-        quadrics[vertex, DIMENSIONS, DIMENSIONS] -= np.sum(offset * origin)
-
-
-@njit(cache=True, nogil=True)
 def offer(queue, mesh, points, quadrics, stamps, vertex, around):
     """Put the collapses of all edges at a vertex, both ways, into the queue."""
     for other in ring(mesh, vertex, around):
-        length = np.sum((points[vertex] - points[other]) ** 2)
+        length = 0.0
+        for x in range(DIMENSIONS):
+            length += (points[vertex, x] - points[other, x]) ** 2
         for gone, kept in ((vertex, other), (other, vertex)):
             price = max(0.0, price_at(quadrics[gone], quadrics[kept], points[kept]))
             price += LENGTH_WEIGHT * length
             heapq.heappush(queue, (price, gone, kept, stamps[gone], stamps[kept]))
+
+
+@njit(cache=True, nogil=True)
+def add_to(first, second):
+    """Add a matrix to another in place."""
+    for i in range(first.shape[0]):
+        for j in range(first.shape[1]):
+            first[i, j] += second[i, j]
 
 
 @njit(cache=True, nogil=True)
@@ -218,19 +189,24 @@ def keeps_sound(mesh, gone, kept):
 @njit(cache=True, nogil=True)
 def normal_at(rest, a, b, c):
     """Normal of a triangle, twice its area long, and its longest edge squared."""
-    x, y, z = rest[b] - rest[a], rest[c] - rest[a], rest[c] - rest[b]
-    normal = np.array(
-        [x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]]
-    )
-    return normal, max(np.sum(x**2), np.sum(y**2), np.sum(z**2))
+    first, second, third = 0.0, 0.0, 0.0
+    for x in range(3):
+        first += (rest[b, x] - rest[a, x]) ** 2
+        second += (rest[c, x] - rest[a, x]) ** 2
+        third += (rest[c, x] - rest[b, x]) ** 2
+    x0, x1, x2 = rest[b, 0] - rest[a, 0], rest[b, 1] - rest[a, 1], rest[b, 2] - rest[a, 2]
+    y0, y1, y2 = rest[c, 0] - rest[a, 0], rest[c, 1] - rest[a, 1], rest[c, 2] - rest[a, 2]
+    normal = (x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0)
+    return normal, max(first, second, third)
 
 
 @njit(cache=True, nogil=True)
 def is_sound(rest, a, b, c, reference):
     """A triangle has some height at rest, and looks where the reference looks."""
     normal, longest = normal_at(rest, a, b, c)
-    wide = np.sum(normal**2) > (LEAST_HEIGHT * longest) ** 2
-    return wide and np.sum(normal * reference) > 0
+    squared = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
+    along = normal[0] * reference[0] + normal[1] * reference[1] + normal[2] * reference[2]
+    return squared > (LEAST_HEIGHT * longest) ** 2 and along > 0
 
 
 @njit(cache=True, nogil=True)
@@ -246,7 +222,7 @@ def collapse(mesh, gone, kept):
         mesh.first_particle[triangle] = -1
         corners = mesh.triangles[triangle]
         if kept in (corners[0], corners[1], corners[2]):
-            corners[:] = -1
+            corners[0] = corners[1] = corners[2] = -1
             continue
         stay.append(triangle)
         for c in range(3):
@@ -302,7 +278,8 @@ def nearest_point(p, a, b, c):
         d0, d1, pp = d0 + u * w, d1 + v * w, pp + w * w
     determinant = e00 * e11 - e01 * e01
     s, t = e11 * d0 - e01 * d1, e00 * d1 - e01 * d0
-    if determinant > 0 and s >= 0 and t >= 0 and s + t <= determinant:
+    upright = determinant > THIN**2 * e00 * e11  # else it is as good as its edges
+    if upright and s >= 0 and t >= 0 and s + t <= determinant:
         s, t = s / determinant, t / determinant
         inside = pp - s * d0 - t * d1
         return max(inside, 0.0), s, t

@@ -38,18 +38,18 @@ class Model(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def start(sheet, triangles, owner):
-    """The model of triangles in particle ids, shape (M, 3), that cover the particles as given."""
-    vertices = np.unique(triangles)
+def start(sheet, vertices, triangles, owner):
+    """The model whose triangles cover the particles as given by `owner`, shape (N,)."""
     weights, outside = np.zeros((len(owner), 3)), np.zeros(len(owner))
-    local = np.searchsorted(vertices, triangles.ravel()).reshape(triangles.shape)
-    for particle in range(len(owner)):
-        if owner[particle] >= 0:
-            own = [owner[particle]]
-            _, weights[particle], outside[particle] = nearest_triangle(
-                sheet.rest, particle, triangles, own
-            )
-    return Model(vertices, local, owner, weights, outside)
+    corners = np.empty_like(triangles)
+    for t in range(len(triangles)):
+        for c in range(3):
+            corners[t, c] = vertices[triangles[t, c]]
+    for i in range(len(owner)):
+        if owner[i] >= 0:
+            own = [owner[i]]
+            _, weights[i], outside[i] = nearest_triangle(sheet.rest, i, corners, own)
+    return Model(vertices, triangles, owner, weights, outside)
 
 
 @njit(cache=True, nogil=True)
@@ -147,7 +147,7 @@ def all_sound(sheet, model, vertices, triangles, touched):
         if touched[t] and triangles[t, 0] >= 0:
             a, b, c = model.triangles[t]
             old = model.vertices
-            reference, _ = normal_at(sheet.rest, old[a], old[b], old[c])
+            reference = normal_at(sheet.rest, old[a], old[b], old[c])[0]
             a, b, c = triangles[t]
             if not is_sound(sheet.rest, vertices[a], vertices[b], vertices[c], reference):
                 return False
@@ -166,7 +166,7 @@ def touching(triangles, vertex):
 
 @njit(cache=True, nogil=True)
 def neighbours(triangles, vertex):
-    """Number of triangles at each neighbour's edge with a vertex, by vertex, shape (K,)."""
+    """Number of triangles that each vertex shares with one, shape (K,); 0 with itself."""
     shared = np.zeros(triangles.max() + 1, dtype=np.int64)
     for t in range(len(triangles)):
         a, b, c = triangles[t]
@@ -190,18 +190,27 @@ def walk(sheet, particle, toward, steps):
             ahead = sheet.rim[toward, 0]
             before, toward = toward, (ahead if ahead != before else sheet.rim[toward, 1])
         return before
-    target = sheet.rest[particle] + steps * (sheet.rest[toward] - sheet.rest[particle])
-    least = np.sum((sheet.rest[before] - target) ** 2)
-    found = True
+    least = beyond(sheet.rest, particle, toward, steps, particle)
+    last, found = particle, True
     while found:
         found = False
         for n in range(sheet.first[before], sheet.first[before + 1]):
             candidate = sheet.other[n]
-            distance = np.sum((sheet.rest[candidate] - target) ** 2)
+            distance = beyond(sheet.rest, particle, toward, steps, candidate)
             if distance < least and sheet.rim[candidate, 0] < 0:
-                particle, least, found = candidate, distance, True
-        before = particle
-    return before
+                last, least, found = candidate, distance, True
+        before = last
+    return last
+
+
+@njit(cache=True, nogil=True)
+def beyond(rest, particle, toward, steps, candidate):
+    """Squared distance of a candidate from where `steps` steps lead from particle `toward`."""
+    squared = 0.0
+    for x in range(3):
+        target = rest[particle, x] + steps * (rest[toward, x] - rest[particle, x])
+        squared += (rest[candidate, x] - target) ** 2
+    return squared
 
 
 @njit(cache=True, nogil=True)
@@ -216,7 +225,7 @@ def best_move(sheet, model, error, vertex, steps):
         if on_rim and toward != sheet.rim[particle, 0] and toward != sheet.rim[particle, 1]:
             continue
         goal = walk(sheet, particle, toward, steps)
-        if np.any(model.vertices == goal):
+        if goal in model.vertices:
             continue
         vertices = model.vertices.copy()
         vertices[vertex] = goal
@@ -238,8 +247,8 @@ def flip(model, first, second):
         for d in range(3):
             if triangles[second, (d + 1) % 3] == a and triangles[second, (d + 2) % 3] == b:
                 other = triangles[second, d]
-                triangles[first] = np.array([apex, b, other])
-                triangles[second] = np.array([apex, other, a])
+                triangles[first, 0], triangles[first, 1], triangles[first, 2] = apex, b, other
+                triangles[second, 0], triangles[second, 1], triangles[second, 2] = apex, other, a
                 return triangles, neighbours(model.triangles, apex)[other] == 0
     return triangles, False
 
@@ -259,14 +268,13 @@ def best_flip(sheet, model, error, vertex):
                 continue
             a, b, c = model.triangles[first]
             d, e, f = model.triangles[second]
-            up = normal_at(rest, old[a], old[b], old[c])[0]
-            up += normal_at(rest, old[d], old[e], old[f])[0]
+            one = normal_at(rest, old[a], old[b], old[c])[0]
+            two = normal_at(rest, old[d], old[e], old[f])[0]
+            up = (one[0] + two[0], one[1] + two[1], one[2] + two[2])
             a, b, c = triangles[first]
             d, e, f = triangles[second]
-            if not (
-                is_sound(rest, old[a], old[b], old[c], up)
-                and is_sound(rest, old[d], old[e], old[f], up)
-            ):
+            sound = is_sound(rest, old[a], old[b], old[c], up)
+            if not (sound and is_sound(rest, old[d], old[e], old[f], up)):
                 continue
             touched = np.zeros(len(at_vertex), dtype=np.bool_)
             touched[first] = touched[second] = True
@@ -284,12 +292,12 @@ def improve(sheet, model, dirty, steps):
     Args:
         sheet: body and goal.
         model: where to start.
-        dirty: vertices to look at, shape (K,); cleared in place.
+        dirty: vertices to look at, shape (K,); changed in place.
         steps: lengths of moves, in neighbours, longest first.
     """
     _, error = fit(sheet, model)
     for _ in range(1000):  # the error falls, so it ends; this is a guard against rounding
-        if not dirty.any():
+        if True not in dirty:
             break
         for vertex in range(len(dirty)):
             if not dirty[vertex]:
@@ -301,12 +309,20 @@ def improve(sheet, model, dirty, steps):
                     break
                 better, lower = best_move(sheet, model, error, vertex, step)
             if lower < error:
-                for t in range(len(model.triangles)):
-                    now, then = better.triangles[t], model.triangles[t]
-                    if vertex in now or vertex in then or np.any(now != then):
-                        dirty[now] = True
+                # A move changes the triangles of the vertex, a flip those of its ring.
+                spread(dirty, model.triangles, vertex)
+                spread(dirty, better.triangles, vertex)
                 model, error = better, lower
     return model
+
+
+@njit(cache=True, nogil=True)
+def spread(dirty, triangles, vertex):
+    """Mark a vertex and its neighbours, in place."""
+    for t in range(len(triangles)):
+        if vertex in triangles[t]:
+            for c in range(3):
+                dirty[triangles[t, c]] = True
 
 
 @njit(cache=True, nogil=True)
@@ -317,15 +333,15 @@ def remove(sheet, model, enough):
     then by their mean square: all distances below `enough` count as equal.
 
     Returns:
-        The model, without gaps in its numbering, and which of its vertices are near the
-        removed one, shape (K - 1,). The same model if no vertex can be removed.
+        The model, where vertices and triangles that are gone are -1, and the vertex; -1 and the
+        same model if none can be removed.
     """
     best, best_gone = model, -1
     best_largest, best_error = np.inf, np.inf
     for gone in range(len(model.vertices)):
         shared_by = neighbours(model.triangles, gone)
         touched = touching(model.triangles, gone)
-        on_rim = np.any(shared_by == 1)
+        on_rim = 1 in shared_by
         for kept in range(len(shared_by)):
             if shared_by[kept] == 0 or (on_rim and shared_by[kept] != 1):
                 continue
@@ -333,15 +349,12 @@ def remove(sheet, model, enough):
             if not possible:
                 continue
             positions, error = fit(sheet, trial)
-            largest = max(enough, distances(sheet, trial, positions).max())
+            largest = max(enough, np.max(distances(sheet, trial, positions)))
             if largest < best_largest - 1e-9 or (
                 largest < best_largest + 1e-9 and error < best_error - ROUNDING
             ):
                 best, best_gone, best_largest, best_error = trial, gone, largest, error
-    if best_gone < 0:
-        return model, np.zeros(len(model.vertices), dtype=np.bool_)
-    near = neighbours(model.triangles, best_gone) > 0
-    return compact(best), near[best.vertices >= 0]
+    return best, best_gone
 
 
 @njit(cache=True, nogil=True)
@@ -352,14 +365,13 @@ def collapsed(sheet, model, gone, kept, touched, shared_by):
     for vertex in range(len(shared_by)):
         if shared_by[vertex] > 0 and common[vertex] > 0:
             both += 1
-            around = touching(model.triangles, vertex).sum()
-            if around == 3 and np.sum(neighbours(model.triangles, vertex) > 0) == 3:
+            if has_three(model.triangles, vertex):
                 return model, False
     triangles = model.triangles.copy()
     left = 0
     for t in range(len(triangles)):
         if touched[t] and kept in triangles[t]:
-            triangles[t] = -1
+            triangles[t, 0] = triangles[t, 1] = triangles[t, 2] = -1
         elif touched[t]:
             left += 1
             for c in range(3):
@@ -374,16 +386,10 @@ def collapsed(sheet, model, gone, kept, touched, shared_by):
 
 
 @njit(cache=True, nogil=True)
-def compact(model):
-    """The model without the rows of what is gone."""
-    alive_vertices, alive = model.vertices >= 0, model.triangles[:, 0] >= 0
-    vertex_number, number = np.cumsum(alive_vertices) - 1, np.cumsum(alive) - 1
-    triangles = model.triangles[alive]
-    for t in range(len(triangles)):
-        for c in range(3):
-            triangles[t, c] = vertex_number[triangles[t, c]]
-    owner = model.owner.copy()
-    for i in range(len(owner)):
-        if owner[i] >= 0:
-            owner[i] = number[owner[i]]
-    return Model(model.vertices[alive_vertices], triangles, owner, model.weights, model.outside)
+def has_three(triangles, vertex):
+    """A vertex inside has three triangles: one fewer, and the two would lie back to back."""
+    around, ring = 0, 0
+    for shared in neighbours(triangles, vertex):
+        around += shared
+        ring += shared > 0
+    return around == 6 and ring == 3
