@@ -154,6 +154,7 @@ def _without_gaps(model: "Model") -> "Model":
         vertices=model.vertices[vertices],
         triangles=vertex_number[model.triangles[triangles]],
         owner=triangle_number[model.owner],
+        sums=model.sums[triangles],
     )
 
 
@@ -226,7 +227,7 @@ def _smallest(
     from jaxsimp.simplify.refine_kernels import distances, fit
 
     def error(size: int) -> float:
-        positions, _ = fit(sheet, models[size])
+        positions, _ = fit(models[size])
         return float(scale * distances(sheet, models[size], positions).max())
 
     size, errors = smallest_fit(error, sorted(models), tolerance)
@@ -234,7 +235,7 @@ def _smallest(
         return no_model(body, tolerance, METHOD)
     best = min(errors, key=errors.__getitem__) if size is None else size
     model = models[best]
-    positions, _ = fit(sheet, model)
+    positions, _ = fit(model)
     off = scale * distances(sheet, model, positions)[model.owner >= 0]
     order = np.argsort(model.vertices)
     used = sheet.area > 0

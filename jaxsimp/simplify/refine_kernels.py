@@ -34,13 +34,13 @@ class Model(NamedTuple):
     triangles: np.ndarray  # (M, 3) indices into vertices; -1 for one that is gone
     owner: np.ndarray  # (N,) triangle of each particle; -1 for a particle of no triangle
     weights: np.ndarray  # (N, 3) barycentric coordinates in it
-    outside: np.ndarray  # (N,) squared distance from it at rest
+    sums: np.ndarray  # (M, 19) of each triangle: its part of the normal equations, see `tally`
 
 
 @njit(cache=True, nogil=True)
 def start(sheet, vertices, triangles, owner):
     """The model whose triangles cover the particles as given by `owner`, shape (N,)."""
-    weights, outside = np.zeros((len(owner), 3)), np.zeros(len(owner))
+    weights, sums = np.zeros((len(owner), 3)), np.zeros((len(triangles), 19))
     corners = np.empty_like(triangles)
     for t in range(len(triangles)):
         for c in range(3):
@@ -48,31 +48,40 @@ def start(sheet, vertices, triangles, owner):
     for i in range(len(owner)):
         if owner[i] >= 0:
             own = [owner[i]]
-            _, weights[i], outside[i] = nearest_triangle(sheet.rest, i, corners, own)
-    return Model(vertices, triangles, owner, weights, outside)
+            _, weights[i], outside = nearest_triangle(sheet.rest, i, corners, own)
+            tally(sums[owner[i]], sheet, i, weights[i], outside)
+    return Model(vertices, triangles, owner, weights, sums)
 
 
 @njit(cache=True, nogil=True)
-def fit(sheet, model):
+def tally(sums, sheet, particle, weights, outside):
+    """Add a particle to the sums of its triangle, in place: (3, 3) of W'W, (3, 3) of W'p, p'p."""
+    area = sheet.area[particle]
+    for r in range(3):
+        scaled = area * weights[r]
+        for c in range(3):
+            sums[3 * r + c] += scaled * weights[c]
+            sums[9 + 3 * r + c] += scaled * sheet.goal[particle, c]
+        sums[18] += area * sheet.goal[particle, r] ** 2
+    # What the model leaves uncovered is an error too, or the outline would shrink.
+    sums[18] += OUTSIDE_WEIGHT * area * outside
+
+
+@njit(cache=True, nogil=True)
+def fit(model):
     """Least-squares positions q, shape (K, 3), and the weighted mean square of p - W q."""
     size = len(model.vertices)
     normal, right = np.zeros((size, size)), np.zeros((size, 3))
     total = 0.0
-    for i in range(len(sheet.rest)):
-        if model.owner[i] < 0:
+    for t in range(len(model.triangles)):
+        if model.triangles[t, 0] < 0:
             continue
-        corners, w, area = model.triangles[model.owner[i]], model.weights[i], sheet.area[i]
+        corners, sums = model.triangles[t], model.sums[t]
         for r in range(3):
-            scaled = area * w[r]
-            for c in range(r + 1):
-                normal[corners[r], corners[c]] += scaled * w[c]
-                if c < r:
-                    normal[corners[c], corners[r]] += scaled * w[c]
-            for x in range(3):
-                right[corners[r], x] += scaled * sheet.goal[i, x]
-        for x in range(3):
-            total += area * sheet.goal[i, x] ** 2
-        total += OUTSIDE_WEIGHT * area * model.outside[i]
+            for c in range(3):
+                normal[corners[r], corners[c]] += sums[3 * r + c]
+                right[corners[r], c] += sums[9 + 3 * r + c]
+        total += sums[18]
     return solve(normal, right, total)
 
 
@@ -133,11 +142,16 @@ def changed(sheet, model, vertices, triangles, touched):
             candidates.append(t)
             for c in range(3):
                 corners[t, c] = vertices[triangles[t, c]]
-    owner, weights, outside = model.owner.copy(), model.weights.copy(), model.outside.copy()
+    owner, weights, sums = model.owner.copy(), model.weights.copy(), model.sums.copy()
+    for t in range(len(triangles)):
+        if touched[t]:
+            for column in range(sums.shape[1]):
+                sums[t, column] = 0.0
     for i in range(len(owner)):
         if owner[i] >= 0 and touched[owner[i]]:
-            owner[i], weights[i], outside[i] = nearest_triangle(sheet.rest, i, corners, candidates)
-    return Model(vertices, triangles, owner, weights, outside)
+            owner[i], weights[i], outside = nearest_triangle(sheet.rest, i, corners, candidates)
+            tally(sums[owner[i]], sheet, i, weights[i], outside)
+    return Model(vertices, triangles, owner, weights, sums)
 
 
 @njit(cache=True, nogil=True)
@@ -231,7 +245,7 @@ def best_move(sheet, model, error, vertex, steps):
         vertices[vertex] = goal
         if all_sound(sheet, model, vertices, model.triangles, touched):
             trial = changed(sheet, model, vertices, model.triangles, touched)
-            trial_error = fit(sheet, trial)[1]
+            trial_error = fit(trial)[1]
             if trial_error < (1 - LEAST_GAIN) * error - ROUNDING:
                 best, error = trial, trial_error
     return best, error
@@ -279,7 +293,7 @@ def best_flip(sheet, model, error, vertex):
             touched = np.zeros(len(at_vertex), dtype=np.bool_)
             touched[first] = touched[second] = True
             trial = changed(sheet, model, old, triangles, touched)
-            trial_error = fit(sheet, trial)[1]
+            trial_error = fit(trial)[1]
             if trial_error < (1 - LEAST_GAIN) * error - ROUNDING:
                 best, error = trial, trial_error
     return best, error
@@ -295,7 +309,7 @@ def improve(sheet, model, dirty, steps):
         dirty: vertices to look at, shape (K,); changed in place.
         steps: lengths of moves, in neighbours, longest first.
     """
-    _, error = fit(sheet, model)
+    _, error = fit(model)
     for _ in range(1000):  # the error falls, so it ends; this is a guard against rounding
         if True not in dirty:
             break
@@ -348,7 +362,7 @@ def remove(sheet, model, enough):
             trial, possible = collapsed(sheet, model, gone, kept, touched, shared_by)
             if not possible:
                 continue
-            positions, error = fit(sheet, trial)
+            positions, error = fit(trial)
             largest = max(enough, np.max(distances(sheet, trial, positions)))
             if largest < best_largest - 1e-9 or (
                 largest < best_largest + 1e-9 and error < best_error - ROUNDING
