@@ -1,5 +1,7 @@
 """Simplification: a goal configuration to the key points that matter for it."""
 
+from typing import Any
+
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions, check_goal
 from jaxsimp.simplify.cloth_meshlab import simplify_meshlab
@@ -44,5 +46,5 @@ def simplify(
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}")
     if len(body.faces):
         return METHODS[method][1](body, check_goal(body, goal)[None], tolerance, max_size)[0]
-    options = {} if max_size is None else {"max_size": max_size}
+    options: dict[str, Any] = {} if max_size is None else {"max_size": max_size}
     return simplify_uniform(body, goal, tolerance=tolerance, **options)

@@ -1,4 +1,4 @@
-"""What the methods for surfaces share: options, boundaries, and the choice by Hausdorff distance."""
+"""What the methods for surfaces share: options, boundaries, the choice by Hausdorff distance."""
 
 from collections.abc import Iterable, Mapping
 

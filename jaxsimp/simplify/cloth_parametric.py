@@ -9,7 +9,6 @@ apart at rest, so they are never mistaken for one.
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,10 +22,8 @@ from jaxsimp.simplify.cloth_common import (
     no_model,
     rest_areas,
 )
+from jaxsimp.simplify.cloth_model import Model, Sheet
 from jaxsimp.simplify.keypoints import KeyPoints, Status, smallest_fit
-
-if TYPE_CHECKING:
-    from jaxsimp.simplify.refine_kernels import Model, Sheet
 
 METHOD = "rest-aware collapse"
 MIN_SIZE = 3  # one triangle
@@ -86,10 +83,8 @@ def simplify_parametric(
         return list(pool.map(one, goals))
 
 
-def _sheet(body: Body, goal: Positions, scale: float) -> "Sheet":
+def _sheet(body: Body, goal: Positions, scale: float) -> Sheet:
     """Body and goal as the compiled functions take them, in lengths of `scale`."""
-    from jaxsimp.simplify.refine_kernels import Sheet
-
     count, faces = body.num_particles, body.faces
     area = np.zeros(count)
     np.add.at(area, faces, rest_areas(body.rest, faces)[:, None] / 3)
@@ -119,32 +114,32 @@ def _rim(faces: Int[np.ndarray, "F 3"], count: int) -> Int[np.ndarray, "N 2"]:
 
 
 def _models(
-    sheet: "Sheet", faces: Int[np.ndarray, "F 3"], size: int, tolerance: float
-) -> dict[int, "Model"]:
+    sheet: Sheet, faces: Int[np.ndarray, "F 3"], size: int, tolerance: float
+) -> dict[int, Model]:
     """Models of all sizes, by size: from `size`, where the mesh has as many, down."""
-    from jaxsimp.simplify import collapse_kernels, refine_kernels
+    from jaxsimp.simplify import cloth_collapse, cloth_fit, cloth_refine
 
     points = np.concatenate([sheet.goal, sheet.rest], axis=1)
     quadrics = _quadrics(points, faces)
-    triangles, owner = collapse_kernels.decimate(
+    triangles, owner = cloth_collapse.decimate(
         points, quadrics, sheet.rest, np.array(faces, dtype=np.int64), size
     )
     vertices, local = np.unique(triangles, return_inverse=True)
-    model = refine_kernels.start(sheet, vertices, local.reshape(-1, 3), owner)
+    model = cloth_fit.start(sheet, vertices, local.reshape(-1, 3), owner)
     steps = _steps(len(sheet.rest))
     near = np.ones(len(model.vertices), dtype=bool)
     models: dict[int, Model] = {}
-    gone = 0
-    while gone >= 0:
-        model = refine_kernels.improve(sheet, model, near, steps)
+    while True:
+        model = cloth_refine.improve(sheet, model, near, steps)
         models[len(model.vertices)] = model
-        smaller, gone = refine_kernels.remove(sheet, model, ENOUGH * tolerance)
-        near = refine_kernels.neighbours(model.triangles, gone) > 0
+        smaller, gone = cloth_refine.remove(sheet, model, ENOUGH * tolerance)
+        if gone < 0:
+            return models
+        near = cloth_fit.neighbours(model.triangles, gone) > 0
         model, near = _without_gaps(smaller), np.delete(near, gone)
-    return models
 
 
-def _without_gaps(model: "Model") -> "Model":
+def _without_gaps(model: Model) -> Model:
     """The model without the rows of what is gone."""
     vertices, triangles = model.vertices >= 0, model.triangles[:, 0] >= 0
     # What refers to nothing, -1, finds the -1 at the end.
@@ -218,13 +213,13 @@ def _steps(num_particles: int) -> Int[np.ndarray, " L"]:
 def _smallest(
     body: Body,
     goal: Positions,
-    sheet: "Sheet",
-    models: dict[int, "Model"],
+    sheet: Sheet,
+    models: dict[int, Model],
     scale: float,
     tolerance: float,
 ) -> KeyPoints:
     """The smallest model that fits, or the best."""
-    from jaxsimp.simplify.refine_kernels import distances, fit
+    from jaxsimp.simplify.cloth_fit import distances, fit
 
     def error(size: int) -> float:
         positions, _ = fit(models[size])

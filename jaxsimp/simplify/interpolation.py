@@ -85,7 +85,7 @@ def _in_triangle(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
         better = squared < least
         least[better] = squared[better]
         best[better] = 0.0
-        best[np.ix_(better, edge)] = coordinates[better]
+        best[np.flatnonzero(better)[:, None], edge] = coordinates[better]
     edges = corners[1:] - corners[0]
     normal = np.cross(*edges)
     longest = np.sum((corners - np.roll(corners, 1, axis=0)) ** 2, axis=1).max()

@@ -6,10 +6,13 @@ that coincide in the goal stay apart, and noise cannot turn a triangle over unse
 """
 
 import heapq
-from typing import NamedTuple
+from typing import no_type_check
 
 import numpy as np
+from jaxtyping import Float, Int
 from numba import njit
+
+from jaxsimp.simplify.cloth_model import Mesh, Points, Triangles, Vector
 
 DIMENSIONS = 6  # goal x, y, z and rest x, y, z
 LEAST_HEIGHT = 1e-3  # of a triangle at rest, relative to its longest edge
@@ -17,23 +20,21 @@ THIN = 1e-6  # sine of an angle that is as good as none
 LENGTH_WEIGHT = 1e-9  # of an edge's squared length in its price: decides where quadrics are zero
 
 
-class Mesh(NamedTuple):
-    """A triangle mesh under decimation; arrays change in place.
-
-    Corner `c` of triangle `f` is number `3 f + c`; the corners of a vertex are a linked list, and
-    so are the particles of a triangle. A triangle that is gone has vertices -1.
-    """
-
-    rest: np.ndarray  # (N, 3)
-    triangles: np.ndarray  # (F, 3)
-    first_corner: np.ndarray  # (N,)
-    next_corner: np.ndarray  # (3 F,)
-    first_particle: np.ndarray  # (F,)
-    next_particle: np.ndarray  # (N,)
+compiled = njit(cache=True, nogil=True)
+Ids = Int[np.ndarray, " _"]
+Matrix = Float[np.ndarray, "7 7"]
+Queue = list[tuple[float, int, int, int, int]]  # price, vertex that goes and one that stays, stamps
 
 
-@njit(cache=True, nogil=True)
-def decimate(points, quadrics, rest, faces, size):
+@compiled
+@no_type_check
+def decimate(
+    points: Float[np.ndarray, "N 6"],
+    quadrics: Float[np.ndarray, "N 7 7"],
+    rest: Points,
+    faces: Triangles,
+    size: int,
+) -> tuple[Triangles, Ids]:
     """Collapse edges until `size` vertices are left, or no collapse is sound.
 
     Args:
@@ -76,8 +77,9 @@ def decimate(points, quadrics, rest, faces, size):
     return survivors(mesh)
 
 
-@njit(cache=True, nogil=True)
-def linked(rest, faces):
+@compiled
+@no_type_check
+def linked(rest: Points, faces: Triangles) -> Mesh:
     """The mesh with its linked lists; each particle is in one triangle that it is a corner of."""
     first_corner = np.full(len(rest), -1, dtype=np.int64)
     next_corner = np.full(3 * len(faces), -1, dtype=np.int64)
@@ -94,8 +96,17 @@ def linked(rest, faces):
     return Mesh(rest, faces.copy(), first_corner, next_corner, first_particle, next_particle)
 
 
-@njit(cache=True, nogil=True)
-def offer(queue, mesh, points, quadrics, stamps, vertex, around):
+@compiled
+@no_type_check
+def offer(
+    queue: Queue,
+    mesh: Mesh,
+    points: Float[np.ndarray, "N 6"],
+    quadrics: Float[np.ndarray, "N 7 7"],
+    stamps: Ids,
+    vertex: int,
+    around: list[int],
+) -> None:
     """Put the collapses of all edges at a vertex, both ways, into the queue."""
     for other in ring(mesh, vertex, around):
         length = 0.0
@@ -107,16 +118,18 @@ def offer(queue, mesh, points, quadrics, stamps, vertex, around):
             heapq.heappush(queue, (price, gone, kept, stamps[gone], stamps[kept]))
 
 
-@njit(cache=True, nogil=True)
-def add_to(first, second):
+@compiled
+@no_type_check
+def add_to(first: Matrix, second: Matrix) -> None:
     """Add a matrix to another in place."""
     for i in range(first.shape[0]):
         for j in range(first.shape[1]):
             first[i, j] += second[i, j]
 
 
-@njit(cache=True, nogil=True)
-def price_at(first, second, point):
+@compiled
+@no_type_check
+def price_at(first: Matrix, second: Matrix, point: Float[np.ndarray, " 6"]) -> float:
     """The sum of two quadrics at a point."""
     total = first[DIMENSIONS, DIMENSIONS] + second[DIMENSIONS, DIMENSIONS]
     for i in range(DIMENSIONS):
@@ -127,8 +140,9 @@ def price_at(first, second, point):
     return total
 
 
-@njit(cache=True, nogil=True)
-def star(mesh, vertex):
+@compiled
+@no_type_check
+def star(mesh: Mesh, vertex: int) -> list[int]:
     """Triangles at a vertex."""
     around = [0][:0]
     corner = mesh.first_corner[vertex]
@@ -139,8 +153,9 @@ def star(mesh, vertex):
     return around
 
 
-@njit(cache=True, nogil=True)
-def ring(mesh, vertex, around):
+@compiled
+@no_type_check
+def ring(mesh: Mesh, vertex: int, around: list[int]) -> list[int]:
     """Neighbours of a vertex, given the triangles at it."""
     others = [0][:0]
     for triangle in around:
@@ -151,8 +166,9 @@ def ring(mesh, vertex, around):
     return others
 
 
-@njit(cache=True, nogil=True)
-def links(mesh, gone, kept):
+@compiled
+@no_type_check
+def links(mesh: Mesh, gone: int, kept: int) -> bool:
     """The collapse leaves a surface of the same topology, and no boundary vertex inside."""
     around_gone, around_kept = star(mesh, gone), star(mesh, kept)
     ring_gone, ring_kept = ring(mesh, gone, around_gone), ring(mesh, kept, around_kept)
@@ -170,8 +186,9 @@ def links(mesh, gone, kept):
     return common == shared and (shared == 1 or not on_rim)
 
 
-@njit(cache=True, nogil=True)
-def keeps_sound(mesh, gone, kept):
+@compiled
+@no_type_check
+def keeps_sound(mesh: Mesh, gone: int, kept: int) -> bool:
     """The collapse leaves triangles, none of them degenerate or turned over at rest."""
     moving = 0
     for triangle in star(mesh, gone):
@@ -186,8 +203,9 @@ def keeps_sound(mesh, gone, kept):
     return moving > 0
 
 
-@njit(cache=True, nogil=True)
-def normal_at(rest, a, b, c):
+@compiled
+@no_type_check
+def normal_at(rest: Points, a: int, b: int, c: int) -> tuple[Vector, float]:
     """Normal of a triangle, twice its area long, and its longest edge squared."""
     first, second, third = 0.0, 0.0, 0.0
     for x in range(3):
@@ -200,8 +218,9 @@ def normal_at(rest, a, b, c):
     return normal, max(first, second, third)
 
 
-@njit(cache=True, nogil=True)
-def is_sound(rest, a, b, c, reference):
+@compiled
+@no_type_check
+def is_sound(rest: Points, a: int, b: int, c: int, reference: Vector) -> bool:
     """A triangle has some height at rest, and looks where the reference looks."""
     normal, longest = normal_at(rest, a, b, c)
     squared = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
@@ -209,8 +228,9 @@ def is_sound(rest, a, b, c, reference):
     return squared > (LEAST_HEIGHT * longest) ** 2 and along > 0
 
 
-@njit(cache=True, nogil=True)
-def collapse(mesh, gone, kept):
+@compiled
+@no_type_check
+def collapse(mesh: Mesh, gone: int, kept: int) -> None:
     """Move `gone` onto `kept`, and put the particles around it into the triangles that stay."""
     around = star(mesh, gone)
     particles, stay = [0][:0], [0][:0]
@@ -242,8 +262,11 @@ def collapse(mesh, gone, kept):
         mesh.first_particle[nearest] = particle
 
 
-@njit(cache=True, nogil=True)
-def nearest_triangle(rest, particle, corners, candidates):
+@compiled
+@no_type_check
+def nearest_triangle(
+    rest: Points, particle: int, corners: Triangles, candidates: list[int]
+) -> tuple[int, Vector, float]:
     """Of some triangles the nearest to a particle at rest, and the barycentric coordinates.
 
     Args:
@@ -268,8 +291,14 @@ def nearest_triangle(rest, particle, corners, candidates):
     return best, weights, least
 
 
-@njit(cache=True, nogil=True)
-def nearest_point(p, a, b, c):
+@compiled
+@no_type_check
+def nearest_point(
+    p: Float[np.ndarray, " 3"],
+    a: Float[np.ndarray, " 3"],
+    b: Float[np.ndarray, " 3"],
+    c: Float[np.ndarray, " 3"],
+) -> Vector:
     """Squared distance of a point from a triangle, and coordinates of b and c in the nearest."""
     e00, e01, e11, d0, d1, pp = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(3):
@@ -299,8 +328,9 @@ def nearest_point(p, a, b, c):
     return max(best, 0.0), first, second
 
 
-@njit(cache=True, nogil=True)
-def survivors(mesh):
+@compiled
+@no_type_check
+def survivors(mesh: Mesh) -> tuple[Triangles, Ids]:
     """Triangles that are left, shape (M, 3), and the one of each particle, shape (N,)."""
     count = np.sum(mesh.triangles[:, 0] >= 0)
     triangles = np.empty((count, 3), dtype=np.int64)
