@@ -17,6 +17,7 @@ from jaxsimp.simplify.cloth_model import Mesh, Points, Triangles, Vector
 DIMENSIONS = 6  # goal x, y, z and rest x, y, z
 LEAST_HEIGHT = 1e-3  # of a triangle at rest, relative to its longest edge
 THIN = 1e-6  # sine of an angle that is as good as none
+SAME = 1e-20  # squared distances that differ by less are equal; a body has the size 1
 LENGTH_WEIGHT = 1e-9  # of an edge's squared length in its price: decides where quadrics are zero
 
 
@@ -32,6 +33,7 @@ def decimate(
     points: Float[np.ndarray, "N 6"],
     quadrics: Float[np.ndarray, "N 7 7"],
     rest: Points,
+    facing: Points,
     faces: Triangles,
     size: int,
 ) -> tuple[Triangles, Ids]:
@@ -42,6 +44,7 @@ def decimate(
         quadrics: squared distances that each vertex stands for, as functions of a point with a
             1 behind it, shape (N, 7, 7); changed in place.
         rest: rest coordinates, shape (N, 3).
+        facing: normals at rest, of any length, shape (N, 3).
         faces: particle ids of the triangles, shape (F, 3), consistently oriented.
         size: number of vertices at which to stop.
 
@@ -49,7 +52,7 @@ def decimate(
         Triangles that are left, shape (M, 3), and the one that covers each particle at rest,
         shape (N,); -1 for a particle of no triangle.
     """
-    mesh = linked(rest, faces)
+    mesh = linked(rest, facing, faces)
     stamps = np.zeros(len(rest), dtype=np.int64)
     queue = [(0.0, -1, -1, 0, 0)]
     left = 0
@@ -79,7 +82,7 @@ def decimate(
 
 @compiled
 @no_type_check
-def linked(rest: Points, faces: Triangles) -> Mesh:
+def linked(rest: Points, facing: Points, faces: Triangles) -> Mesh:
     """The mesh with its linked lists; each particle is in one triangle that it is a corner of."""
     first_corner = np.full(len(rest), -1, dtype=np.int64)
     next_corner = np.full(3 * len(faces), -1, dtype=np.int64)
@@ -93,7 +96,9 @@ def linked(rest: Points, faces: Triangles) -> Mesh:
                 first_particle[face] = vertex
             next_corner[3 * face + c] = first_corner[vertex]
             first_corner[vertex] = 3 * face + c
-    return Mesh(rest, faces.copy(), first_corner, next_corner, first_particle, next_particle)
+    return Mesh(
+        rest, facing, faces.copy(), first_corner, next_corner, first_particle, next_particle
+    )
 
 
 @compiled
@@ -257,7 +262,7 @@ def collapse(mesh: Mesh, gone: int, kept: int) -> None:
                 mesh.next_corner[3 * triangle + c] = mesh.first_corner[kept]
                 mesh.first_corner[kept] = 3 * triangle + c
     for particle in particles:
-        nearest = nearest_triangle(mesh.rest, particle, mesh.triangles, stay)[0]
+        nearest = nearest_triangle(mesh.rest, mesh.facing, particle, mesh.triangles, stay)[0]
         mesh.next_particle[particle] = mesh.first_particle[nearest]
         mesh.first_particle[nearest] = particle
 
@@ -265,12 +270,16 @@ def collapse(mesh: Mesh, gone: int, kept: int) -> None:
 @compiled
 @no_type_check
 def nearest_triangle(
-    rest: Points, particle: int, corners: Triangles, candidates: list[int]
+    rest: Points, facing: Points, particle: int, corners: Triangles, candidates: list[int]
 ) -> tuple[int, Vector, float]:
     """Of some triangles the nearest to a particle at rest, and the barycentric coordinates.
 
+    Of those that are equally near one that looks where the particle looks, if there is one: two
+    sides of a body may lie on each other at rest.
+
     Args:
         rest: rest coordinates, shape (N, 3).
+        facing: normals at the particles at rest, of any length, shape (N, 3).
         particle: its id.
         corners: particle ids of all triangles, shape (M, 3).
         candidates: ids of the triangles to choose from.
@@ -279,14 +288,22 @@ def nearest_triangle(
         Triangle id, the coordinates of its point nearest to the particle, and the squared
         distance of that.
     """
-    best, least = candidates[0], np.inf
+    best, least, best_faces = candidates[0], np.inf, False
     weights = (1.0, 0.0, 0.0)
     for triangle in candidates:
         a, b, c = corners[triangle]
         squared, first, second = nearest_point(rest[particle], rest[a], rest[b], rest[c])
-        if squared < least:
-            best, least, weights = triangle, squared, (1.0 - first - second, first, second)
-            if squared < 1e-24:
+        if squared > least + SAME or (best_faces and squared > least - SAME):
+            continue
+        normal = normal_at(rest, a, b, c)[0]
+        along = 0.0
+        for x in range(3):
+            along += normal[x] * facing[particle, x]
+        faces = along >= 0
+        if faces or squared < least - SAME:
+            best, least, best_faces = triangle, squared, faces
+            weights = (1.0 - first - second, first, second)
+            if faces and squared < SAME:
                 break
     return best, weights, least
 

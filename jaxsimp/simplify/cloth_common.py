@@ -48,6 +48,26 @@ def boundary(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "E 2"], Int
     return edges[alone], alone % len(faces)
 
 
+def inner_edges(
+    faces: Int[np.ndarray, "F 3"],
+) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "E 2"], Int[np.ndarray, "E 2"]]:
+    """Edges of two triangles, the vertices opposite to them, and the triangles, (E, 2) each.
+
+    An edge runs as in its first triangle.
+
+    Args:
+        faces: vertex ids of the triangles, shape (F, 3).
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    opposite = faces[:, [2, 0, 1]].T.ravel()
+    _, where, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    order = np.argsort(where, kind="stable")
+    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
+    return edges[pairs[:, 0]], opposite[pairs], pairs % len(faces)
+
+
 def fewest_vertices(
     body: Body,
     goal: Positions,
@@ -126,14 +146,14 @@ def no_model(body: Body, tolerance: float, method: str) -> KeyPoints:
     )
 
 
-def rest_areas(
+def rest_normals(
     rest: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, " F"]:
-    """Areas of triangles at rest, shape (F,), square metres.
+) -> Float[np.ndarray, "F 3"]:
+    """Normals of triangles at rest, as long as the triangles are large, shape (F, 3).
 
     Args:
         rest: rest coordinates, shape (N, 3), metres.
         faces: vertex ids of the triangles, shape (F, 3).
     """
-    corners = rest[faces]
-    return np.linalg.norm(np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)), axis=1) / 2
+    first, second = np.moveaxis(rest[faces[:, 1:]] - rest[faces[:, :1]], 1, 0)
+    return np.cross(first, second) / 2

@@ -24,7 +24,7 @@ def start(sheet: Sheet, vertices: Ids, triangles: Triangles, owner: Ids) -> Mode
     for i in range(len(owner)):
         if owner[i] >= 0:
             own = [owner[i]]
-            _, weights[i], outside = nearest_triangle(sheet.rest, i, corners, own)
+            _, weights[i], outside = nearest_triangle(sheet.rest, sheet.facing, i, corners, own)
             tally(sums[owner[i]], sheet, i, weights[i], outside)
     return Model(vertices, triangles, owner, weights, sums)
 
@@ -142,7 +142,9 @@ def changed(
                 sums[t, column] = 0.0
     for i in range(len(owner)):
         if owner[i] >= 0 and touched[owner[i]]:
-            owner[i], weights[i], outside = nearest_triangle(sheet.rest, i, corners, candidates)
+            owner[i], weights[i], outside = nearest_triangle(
+                sheet.rest, sheet.facing, i, corners, candidates
+            )
             tally(sums[owner[i]], sheet, i, weights[i], outside)
     return Model(vertices, triangles, owner, weights, sums)
 

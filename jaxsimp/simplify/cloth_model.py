@@ -15,6 +15,7 @@ class Sheet(NamedTuple):
 
     Attributes:
         rest: rest coordinates, shape (N, 3), centred.
+        facing: normals at rest, of any length, shape (N, 3).
         goal: goal positions, shape (N, 3), centred.
         area: of each particle at rest, its weight, shape (N,), summing to 1.
         first: particle i has the neighbours `other[first[i] : first[i + 1]]`, shape (N + 1,).
@@ -23,6 +24,7 @@ class Sheet(NamedTuple):
     """
 
     rest: Points
+    facing: Points
     goal: Points
     area: Float[ndarray, " N"]
     first: Int[ndarray, " N+1"]
@@ -57,6 +59,7 @@ class Mesh(NamedTuple):
 
     Attributes:
         rest: rest coordinates, shape (N, 3).
+        facing: normals at rest, of any length, shape (N, 3).
         triangles: particle ids, shape (F, 3); -1 for one that is gone.
         first_corner: of each vertex, shape (N,).
         next_corner: of the same vertex, shape (3 F,).
@@ -65,6 +68,7 @@ class Mesh(NamedTuple):
     """
 
     rest: Points
+    facing: Points
     triangles: Triangles
     first_corner: Int[ndarray, " N"]
     next_corner: Int[ndarray, " 3*F"]

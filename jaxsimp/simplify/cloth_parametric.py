@@ -19,8 +19,9 @@ from jaxsimp.simplify.cloth_common import (
     DEFAULT_MAX_SIZE,
     boundary,
     check_options,
+    inner_edges,
     no_model,
-    rest_areas,
+    rest_normals,
 )
 from jaxsimp.simplify.cloth_model import Model, Sheet
 from jaxsimp.simplify.keypoints import KeyPoints, Status, smallest_fit
@@ -68,7 +69,7 @@ def simplify_parametric(
         ValueError: if the body has no triangles, the tolerance is not above zero, or
             `max_size` is below 3.
     """
-    scale = float(np.sqrt(rest_areas(body.rest, body.faces).sum()))
+    scale = float(np.sqrt(np.linalg.norm(rest_normals(body.rest, body.faces), axis=1).sum()))
     tolerance = TOLERANCE * scale if tolerance is None else tolerance
     max_size = DEFAULT_MAX_SIZE if max_size is None else max_size
     check_options(body, tolerance, max_size, MIN_SIZE)
@@ -86,13 +87,16 @@ def simplify_parametric(
 def _sheet(body: Body, goal: Positions, scale: float) -> Sheet:
     """Body and goal as the compiled functions take them, in lengths of `scale`."""
     count, faces = body.num_particles, body.faces
-    area = np.zeros(count)
-    np.add.at(area, faces, rest_areas(body.rest, faces)[:, None] / 3)
+    normals = rest_normals(body.rest / scale, faces)
+    area, facing = np.zeros(count), np.zeros((count, 3))
+    np.add.at(area, faces, np.linalg.norm(normals, axis=1, keepdims=True) / 3)
+    np.add.at(facing, faces, normals[:, None])
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
     used = area > 0
     return Sheet(
         rest=(body.rest - body.rest[used].mean(axis=0)) / scale,
+        facing=facing,
         goal=(goal - goal[used].mean(axis=0)) / scale,
         area=area / area.sum(),
         first=np.searchsorted(edges[:, 0], np.arange(count + 1)),
@@ -120,9 +124,9 @@ def _models(
     from jaxsimp.simplify import cloth_collapse, cloth_fit, cloth_refine
 
     points = np.concatenate([sheet.goal, sheet.rest], axis=1)
-    quadrics = _quadrics(points, faces)
+    quadrics = _quadrics(points, faces, _outline(sheet.rest, faces))
     triangles, owner = cloth_collapse.decimate(
-        points, quadrics, sheet.rest, np.array(faces, dtype=np.int64), size
+        points, quadrics, sheet.rest, sheet.facing, np.array(faces, dtype=np.int64), size
     )
     vertices, local = np.unique(triangles, return_inverse=True)
     model = cloth_fit.start(sheet, vertices, local.reshape(-1, 3), owner)
@@ -153,24 +157,43 @@ def _without_gaps(model: Model) -> Model:
     )
 
 
+def _outline(
+    rest: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"]
+) -> Int[np.ndarray, "E 3"]:
+    """Edges where the body ends at rest and the third vertex of their triangles, shape (E, 3).
+
+    Besides the boundary these are edges where the body turns back on itself, as a flat shirt
+    does at its sides: there are two triangles at each.
+    """
+    edges, owner = boundary(faces)
+    apex = faces[owner].sum(axis=1) - edges.sum(axis=1)
+    inner, apexes, pairs = inner_edges(faces)
+    normals = rest_normals(rest, faces)[pairs]
+    back = np.sum(normals[:, 0] * normals[:, 1], axis=1) < 0
+    return np.concatenate(
+        [np.column_stack([edges, apex])]
+        + [np.column_stack([inner[back], apexes[back, side]]) for side in (0, 1)]
+    )
+
+
 def _quadrics(
-    points: Float[np.ndarray, "N 6"], faces: Int[np.ndarray, "F 3"]
+    points: Float[np.ndarray, "N 6"],
+    faces: Int[np.ndarray, "F 3"],
+    outline: Int[np.ndarray, "E 3"],
 ) -> Float[np.ndarray, "N 7 7"]:
-    """Squared distances from the planes of each vertex's triangles and boundary edges.
+    """Squared distances from the planes of each vertex's triangles and from its outline.
 
     As functions of a point with a 1 behind it. A triangle's plane counts by its area. An edge of
-    the boundary adds the distance from it within the plane of its triangle.
+    the outline adds the distance from it within the plane of its triangle.
     """
     quadrics = np.zeros((len(points), 7, 7))
     along, across, area = _frames(points[faces])
     off = np.eye(6) - along[:, :, None] * along[:, None] - across[:, :, None] * across[:, None]
     _add_quadrics(quadrics, points, faces, off * area[:, None, None])
-    edges, owner = boundary(faces)
-    apex = faces[owner].sum(axis=1) - edges.sum(axis=1)
-    _, across, _ = _frames(points[np.column_stack([edges, apex])])
-    squared = np.sum((points[edges[:, 1]] - points[edges[:, 0]]) ** 2, axis=1)
+    _, across, _ = _frames(points[outline])
+    squared = np.sum((points[outline[:, 1]] - points[outline[:, 0]]) ** 2, axis=1)
     off = across[:, :, None] * across[:, None] * (BOUNDARY_WEIGHT * squared)[:, None, None]
-    _add_quadrics(quadrics, points, edges, off)
+    _add_quadrics(quadrics, points, outline[:, :2], off)
     return quadrics
 
 

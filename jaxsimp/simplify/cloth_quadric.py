@@ -19,6 +19,7 @@ from jaxsimp.simplify.cloth_common import (
     boundary,
     check_options,
     fewest_vertices,
+    inner_edges,
 )
 from jaxsimp.simplify.keypoints import KeyPoints
 
@@ -88,7 +89,7 @@ def follow_creases(body: Body, goal: Positions) -> Int[np.ndarray, "F 3"]:
         goal: goal positions, shape (N, 3), metres.
     """
     faces = body.faces.copy()
-    edges, others, pairs = _diagonals(faces)
+    edges, others, pairs = inner_edges(faces)
     a, b, c, d = *edges.T, *others.T
     flipped = np.stack([np.stack([c, a, d], axis=1), np.stack([d, b, c], axis=1)], axis=1)
     # The two triangles are a flat convex quadrangle if both diagonals give the same area.
@@ -227,21 +228,6 @@ class _Collapses:
         error = np.einsum("pi,pij,pj->p", target, quadric, target)
         length = np.linalg.norm(self.points[kept] - self.points[removed], axis=1)
         return np.maximum(error / ROUNDING, 1.0).round(6).tolist(), length.round(6).tolist()
-
-
-def _diagonals(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges of two triangles, the vertices opposite to them, and the triangles, (E, 2) each.
-
-    An edge runs as in its first triangle.
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    opposite = faces[:, [2, 0, 1]].T.ravel()
-    _, where, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    order = np.argsort(where, kind="stable")
-    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
-    return edges[pairs[:, 0]], opposite[pairs], pairs % len(faces)
 
 
 def _area(points: np.ndarray, quads: np.ndarray) -> np.ndarray:

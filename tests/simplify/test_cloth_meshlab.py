@@ -37,9 +37,7 @@ def test_ids_survive_a_decimation():
     triangles = decimate(pymeshlab, points, faces, 20)
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(points, faces))
-    meshes.meshing_decimation_quadric_edge_collapse(
-        targetfacenum=20, **cloth_meshlab.PARAMETERS
-    )
+    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=20, **cloth_meshlab.PARAMETERS)
     mesh = meshes.current_mesh()
     expected = mesh.vertex_matrix()[mesh.face_matrix()]
     assert len(triangles) == len(expected) < len(faces)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from experiments.ideal_goals import FOLDS, NOISES, add_noise, ideal_goal, is_right
 from jaxsimp import body, goals
 from jaxsimp.simplify import cloth_parametric, simplify
-from jaxsimp.simplify.cloth_common import boundary, rest_areas
+from jaxsimp.simplify.cloth_common import boundary, rest_normals
 from jaxsimp.simplify.cloth_parametric import simplify_parametric
 from jaxsimp.simplify.interpolation import interpolation_weights
 from jaxsimp.simplify.keypoints import Status
@@ -175,7 +175,7 @@ def test_models_of_every_size_are_discs_that_cover_the_sheet(seed):
 
 
 def all_models(sheet, goal, size=24):
-    scale = np.sqrt(rest_areas(sheet.rest, sheet.faces).sum())
+    scale = np.sqrt(np.linalg.norm(rest_normals(sheet.rest, sheet.faces), axis=1).sum())
     return cloth_parametric._models(
         cloth_parametric._sheet(sheet, goal, scale), sheet.faces, size, 0.1
     )
