@@ -141,13 +141,13 @@ def _error(model: dict[str, Any]) -> float:
 
 
 def _run_table(rows: Rows) -> list[str]:
-    table = []
+    lines = []
     for task in dict.fromkeys(row["task"] for row in rows):
         for method, runs in _methods(_of(rows, task=task)).items():
             scores = np.array([_score(run) for run in runs])
             successes = sum(run["success"] for run in runs)
             low, high = success_interval(successes, len(runs))
-            table.append(
+            lines.append(
                 [
                     task,
                     method,
@@ -170,5 +170,5 @@ def _run_table(rows: Rows) -> list[str]:
             "seconds to plan",
             "compile seconds, all runs",
         ],
-        table,
+        lines,
     )

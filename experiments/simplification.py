@@ -21,14 +21,13 @@ from experiments.ideal_goals import (
     FOLDS,
     LINES,
     NOISES,
-    SETTLED_FOLDS,
     IdealGoal,
     add_noise,
     ideal_goal,
     ideal_line,
     is_right,
-    settled_goal,
 )
+from experiments.settled_goals import SETTLED_FOLDS, settled_goal
 from jaxsimp.body import Body, cloth, rope
 from jaxsimp.simplify import METHODS, simplify_batch
 
@@ -158,9 +157,10 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     done = {_identity(row) for row in records.read_rows(path)}
     cases = list(study.cases())
     left = [
-        case
+        (case, method)
         for case in cases
-        if not all((*asdict(case).values(), m) in done for m in study.methods)
+        for method in study.methods
+        if (*asdict(case).values(), method) not in done
     ]
     columns = (
         TextColumn("{task.description}"),

@@ -5,6 +5,8 @@ from jaxtyping import Float
 
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions, as_goal
+from jaxsimp.simplify.cloth_meshlab import simplify_meshlab
+from jaxsimp.simplify.cloth_parametric import simplify_parametric
 from jaxsimp.simplify.cloth_quadric import simplify_quadric
 from jaxsimp.simplify.keypoints import KeyPoints, Status
 from jaxsimp.simplify.rope_fit import Workspace
@@ -18,16 +20,19 @@ __all__ = [
     "Workspace",
     "simplify",
     "simplify_batch",
+    "simplify_meshlab",
     "simplify_optimal",
+    "simplify_parametric",
     "simplify_quadric",
     "simplify_uniform",
 ]
 
-# A method is one function for ropes and one for surfaces.
 METHODS = {
-    "robust": (simplify_optimal, simplify_quadric),
+    "robust": (simplify_optimal, simplify_parametric),
     "paper": (simplify_uniform, simplify_quadric),
+    "meshlab": (simplify_uniform, simplify_meshlab),
 }
+"""A method by its name: one function for ropes and one for surfaces."""
 
 
 def simplify_batch(
@@ -45,8 +50,10 @@ def simplify_batch(
     Args:
         body: a rope, or a body with triangles.
         goals: goal positions, shape (B, N, 3), metres.
-        method: "robust": the best breakpoints for ropes; "paper": evenly spread breakpoints for
-            ropes, quadric edge collapse with the Hausdorff distance for surfaces.
+        method: "robust": the best breakpoints for ropes, a collapse that knows rest coordinates
+            for surfaces; "paper": evenly spread breakpoints for ropes, quadric edge collapse
+            with the Hausdorff distance for surfaces; "meshlab": the same with the paper's own
+            tool, an extra.
         tolerance: error below which a model fits, metres; the method's own by default.
         max_size: largest number of key points tried; the method's own by default.
 
@@ -56,10 +63,11 @@ def simplify_batch(
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}")
-    if len(body.faces):
-        options = {} if max_size is None else {"max_size": max_size}
-        return [simplify_quadric(body, goal, tolerance=tolerance, **options) for goal in goals]
-    return METHODS[method][0](body, goals, tolerance, max_size)
+    checked = [as_goal(body, goal) for goal in goals]
+    if not checked:
+        return []
+    simplify_goals = METHODS[method][len(body.faces) > 0]
+    return simplify_goals(body, np.stack(checked), tolerance, max_size)
 
 
 def simplify(
@@ -82,7 +90,7 @@ def simplify(
     Raises:
         ValueError: as for `simplify_batch`, or if no model fits.
     """
-    goals = as_goal(body, goal)[None]
+    goals = np.asarray(goal)[None]
     (points,) = simplify_batch(body, goals, method=method, tolerance=tolerance, max_size=max_size)
     if points.status != Status.FITS:
         raise ValueError(

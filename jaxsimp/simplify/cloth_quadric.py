@@ -13,10 +13,15 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.body import Body
-from jaxsimp.goals import Positions, as_goal
-from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
-from jaxsimp.simplify.interpolation import interpolation_weights, model_errors
-from jaxsimp.simplify.keypoints import KeyPoints, smallest_fit
+from jaxsimp.goals import Positions
+from jaxsimp.simplify.cloth_common import (
+    DEFAULT_MAX_SIZE,
+    boundary,
+    check_options,
+    fewest_vertices,
+    inner_edges,
+)
+from jaxsimp.simplify.keypoints import KeyPoints
 
 MIN_SIZE = 4  # two triangles, where the paper starts
 # Weights of the planes of boundary edges and turns, for a mesh scaled to half an extent of 1,
@@ -31,18 +36,15 @@ ROUNDING = 1e-10  # quadric errors below this are rounding
 
 def simplify_quadric(
     body: Body,
-    goal: Positions,
-    *,
+    goals: Float[np.ndarray, "B N 3"],
     tolerance: float | None = None,
-    max_size: int = 24,
-) -> KeyPoints:
-    """Key points of a surface: the vertices of the smallest mesh that covers the goal.
+    max_size: int | None = None,
+) -> list[KeyPoints]:
+    """Key points of goals of a surface: the vertices of the smallest mesh that covers each.
 
-    The goal's mesh is decimated once, down to four vertices where its topology allows;
-    the sizes on the way are compared with the goal from the smallest up. The error is the
-    Hausdorff distance, surface to surface, from samples that are a tenth of the tolerance
-    apart, or an eighth of the body's spacing if that is more: it may be below the true
-    distance by 0.58 of that.
+    A goal's mesh is decimated once, down to four vertices where its topology allows; the
+    sizes on the way are compared with the goal from the smallest up, by the Hausdorff
+    distance (see `fewest_vertices`).
 
     Two steps go beyond the paper's tool: `follow_creases` prepares the mesh, and turns of
     the boundary are held in place like its edges. Without them a fold along the diagonal
@@ -50,45 +52,28 @@ def simplify_quadric(
 
     Args:
         body: a body with triangles.
-        goal: goal positions, shape (N, 3), metres.
+        goals: goal positions, shape (B, N, 3), metres.
         tolerance: Hausdorff distance below which a mesh fits, metres; a tenth of the
             body's size by default.
-        max_size: largest number of key points tried.
+        max_size: largest number of key points tried; 24 by default.
+
+    Returns:
+        Key points of each goal. Where no mesh of up to `max_size` vertices fits the status is
+        `NO_FIT` and it is the best of them.
 
     Raises:
-        ValueError: if the body has no triangles, the goal is not one of this body, the
-            tolerance is not above zero, `max_size` is below 4, or no mesh of up to
-            `max_size` key points fits.
+        ValueError: if the body has no triangles, the tolerance is not above zero, or
+            `max_size` is below 4.
     """
-    goal = as_goal(body, goal)
     tolerance = 0.1 * body.size if tolerance is None else tolerance
-    _check_options(body, tolerance, max_size)
-    meshes = collapse_sequence(goal, follow_creases(body, goal), max_size)
-    original = Surface(goal, body.faces)
-    sampling = max(tolerance / 10, body.spacing / 8)
-
-    def error(size: int) -> float:
-        return hausdorff_distance(original, Surface(goal, meshes[size]), sampling)
-
-    size, errors = smallest_fit(error, sorted(meshes), tolerance)
-    if size is None:
-        raise ValueError(_no_fit(errors, tolerance, max_size))
-    particles, elements = np.unique(meshes[size], return_inverse=True)
-    elements = elements.reshape(-1, 3)
-    weights = interpolation_weights(body.rest, particles, elements)
-    largest, mean = model_errors(goal, weights, goal[particles])
-    return KeyPoints(
-        particles=particles,
-        positions=goal[particles],
-        elements=elements,
-        num_particles=body.num_particles,
-        method="quadric collapse",
-        sizes=tuple(errors),
-        errors=tuple(errors.values()),
-        tolerance=tolerance,
-        max_error=largest,
-        rms_error=mean,
-    )
+    max_size = DEFAULT_MAX_SIZE if max_size is None else max_size
+    check_options(body, tolerance, max_size, MIN_SIZE)
+    found = []
+    for goal in goals:
+        meshes = collapse_sequence(goal, follow_creases(body, goal), max_size)
+        sizes = sorted(meshes)
+        found.append(fewest_vertices(body, goal, meshes, sizes, tolerance, "quadric collapse"))
+    return found
 
 
 def follow_creases(body: Body, goal: Positions) -> Int[np.ndarray, "F 3"]:
@@ -104,7 +89,7 @@ def follow_creases(body: Body, goal: Positions) -> Int[np.ndarray, "F 3"]:
         goal: goal positions, shape (N, 3), metres.
     """
     faces = body.faces.copy()
-    edges, others, pairs = _diagonals(faces)
+    edges, others, pairs = inner_edges(faces)
     a, b, c, d = *edges.T, *others.T
     flipped = np.stack([np.stack([c, a, d], axis=1), np.stack([d, b, c], axis=1)], axis=1)
     # The two triangles are a flat convex quadrangle if both diagonals give the same area.
@@ -245,21 +230,6 @@ class _Collapses:
         return np.maximum(error / ROUNDING, 1.0).round(6).tolist(), length.round(6).tolist()
 
 
-def _diagonals(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges of two triangles, the vertices opposite to them, and the triangles, (E, 2) each.
-
-    An edge runs as in its first triangle.
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    opposite = faces[:, [2, 0, 1]].T.ravel()
-    _, where, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    order = np.argsort(where, kind="stable")
-    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
-    return edges[pairs[:, 0]], opposite[pairs], pairs % len(faces)
-
-
 def _area(points: np.ndarray, quads: np.ndarray) -> np.ndarray:
     """Areas of pairs of triangles, given as vertex ids of shape (E, 2, 3)."""
     normals, _ = _normals(points[quads].reshape(-1, 3, 3))
@@ -284,7 +254,7 @@ def _quadrics(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     area = np.linalg.norm(normals, axis=1) / 2
     quadrics = np.zeros((len(points), 4, 4))
     _add_planes(quadrics, points, faces, normals, area)
-    edges, owner = _boundary(faces)
+    edges, owner = boundary(faces)
     along = points[edges[:, 1]] - points[edges[:, 0]]
     weight = BOUNDARY_WEIGHT * np.linalg.norm(along, axis=1)
     _add_planes(quadrics, points, edges, np.cross(along, normals[owner]), weight)
@@ -328,16 +298,6 @@ def _add_planes(
         np.add.at(quadrics, vertices, quadric)
 
 
-def _boundary(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of one triangle only, shape (E, 2), and the triangle of each."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, index, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    alone = index[count == 1]
-    return edges[alone], alone % len(faces)
-
-
 def _normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals of triangles, twice their area long, and their longest edges squared."""
     edges = corners[:, [1, 2, 0]] - corners
@@ -348,22 +308,3 @@ def _normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _homogeneous(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.ones((len(points), 1))], axis=1)
-
-
-def _check_options(body: Body, tolerance: float, max_size: int) -> None:
-    if len(body.faces) == 0:
-        raise ValueError(f"the {body.name} has 0 triangles; give a body with triangles")
-    if not 0 < tolerance < np.inf:
-        raise ValueError(f"tolerance is {tolerance:g}; give a distance above zero, in metres")
-    if max_size < MIN_SIZE:
-        raise ValueError(f"max_size is {max_size}; at least {MIN_SIZE} is needed")
-
-
-def _no_fit(errors: dict[int, float], tolerance: float, max_size: int) -> str:
-    best = "the mesh allows none"
-    if errors:
-        best = f"the best is off by {min(errors.values()):.3g} m"
-    return (
-        f"no mesh of up to {max_size} key points is within the tolerance of {tolerance:.3g} m: "
-        f"{best}; raise tolerance or max_size"
-    )

@@ -8,6 +8,8 @@ and `W q` see every layer of a folded goal, as distances between surfaces cannot
 import numpy as np
 from jaxtyping import Float, Int
 
+THIN = 1e-6  # height over longest edge, below which a triangle is treated as its edges
+
 
 def interpolation_weights(
     rest: Float[np.ndarray, "N 3"],
@@ -16,21 +18,25 @@ def interpolation_weights(
 ) -> Float[np.ndarray, "N K"]:
     """Weights of the key points in the model's position of every particle, shape (N, K).
 
+    Of simplices that are equally near the first counts. So parts of a body that lie on each
+    other at rest, as the two sides of a flat shirt, cannot be told apart.
+
     Args:
         rest: rest coordinates of the particles, metres.
         particles: ids of the key points.
         elements: segments (E = 2) or triangles (E = 3) as indices into `particles`, at least one.
     """
-    import igl
-
-    corners = np.ascontiguousarray(rest[particles], dtype=np.float64)
-    simplices = np.ascontiguousarray(elements, dtype=np.int64)
-    points = np.ascontiguousarray(rest, dtype=np.float64)
-    _, nearest, feet = igl.point_mesh_squared_distance(points, corners, simplices)
-    chosen = simplices[nearest]
+    least = np.full(len(rest), np.inf)
+    chosen = np.zeros(len(rest), dtype=int)
+    coordinates = np.zeros((len(rest), elements.shape[1]))
+    closer = 1e-12 * np.ptp(rest, axis=0).max() ** 2  # than rounding
+    for index, element in enumerate(elements):
+        nearest, squared = nearest_in_simplex(rest, rest[particles[element]])
+        better = squared < least - closer
+        least[better], chosen[better] = squared[better], index
+        coordinates[better] = nearest[better]
     weights = np.zeros((len(rest), len(particles)))
-    rows = np.arange(len(rest))[:, None]
-    weights[rows, chosen] = _barycentric(feet, corners[chosen])
+    np.add.at(weights, (np.arange(len(rest))[:, None], elements[chosen]), coordinates)
     return weights
 
 
@@ -44,11 +50,53 @@ def model_errors(
     return float(np.sqrt(squared.max())), float(np.sqrt(squared.mean()))
 
 
-def _barycentric(
-    points: Float[np.ndarray, "N 3"], corners: Float[np.ndarray, "N E 3"]
-) -> Float[np.ndarray, "N E"]:
-    """Barycentric coordinates of points of segments or triangles, shape (N, E)."""
-    edges = corners[:, 1:] - corners[:, :1]
-    along = np.linalg.pinv(np.swapaxes(edges, 1, 2)) @ (points - corners[:, 0])[:, :, None]
-    inner = np.clip(along[:, :, 0], 0.0, 1.0)
-    return np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+def nearest_in_simplex(
+    points: Float[np.ndarray, "N 3"], corners: Float[np.ndarray, "E 3"]
+) -> tuple[Float[np.ndarray, "N E"], Float[np.ndarray, " N"]]:
+    """Barycentric coordinates of the nearest points of a simplex, and squared distances to them.
+
+    Args:
+        points: shape (N, 3), metres.
+        corners: of a segment (E = 2) or a triangle (E = 3), which may have no length or area.
+
+    Returns:
+        Coordinates, shape (N, E), none below zero and each row summing to 1; and squared
+        distances, shape (N,), square metres.
+    """
+    if len(corners) == 2:
+        coordinates = _in_segment(points, corners)
+    else:
+        coordinates = _in_triangle(points, corners)
+    return coordinates, np.sum((coordinates @ corners - points) ** 2, axis=1)
+
+
+def _in_segment(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    edge = corners[1] - corners[0]
+    length = max(edge @ edge, np.finfo(float).tiny)
+    along = np.clip((points - corners[0]) @ edge / length, 0.0, 1.0)
+    return np.stack([1.0 - along, along], axis=1)
+
+
+def _in_triangle(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    best = np.zeros((len(points), 3))
+    least = np.full(len(points), np.inf)
+    for edge in ([0, 1], [1, 2], [2, 0]):
+        coordinates, squared = nearest_in_simplex(points, corners[edge])
+        better = squared < least
+        least[better] = squared[better]
+        best[better] = 0.0
+        best[np.flatnonzero(better)[:, None], edge] = coordinates[better]
+    edges = corners[1:] - corners[0]
+    normal = np.cross(*edges)
+    longest = np.sum((corners - np.roll(corners, 1, axis=0)) ** 2, axis=1).max()
+    if np.linalg.norm(normal) <= THIN * longest:
+        return best
+    # The coordinate of a corner is the share of the triangle that the opposite edge makes with
+    # the point: two areas along the normal, and what is left.
+    offset = points - corners[0]
+    inner = np.stack([np.cross(offset, edges[1]), np.cross(edges[0], offset)]) @ normal
+    inner /= normal @ normal
+    flat = np.column_stack([1.0 - inner.sum(axis=0), inner.T])
+    within = (flat >= 0).all(axis=1)
+    best[within] = flat[within]
+    return best
