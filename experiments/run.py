@@ -99,7 +99,7 @@ class PlanOptions:
         if self.list:
             _list(console)
             return
-        study, folder = self.configuration(), _folder(self)
+        study, folder = self.configuration(), results_folder(self)
         records.open_folder(folder, study.identity())
         # Here, so that --help and wrong options do not wait for matplotlib.
         from experiments.plan_report import write_report
@@ -176,7 +176,7 @@ class SimplificationOptions:
 
     def run(self, console: Console) -> None:
         """Run the study."""
-        study, folder = self.configuration(), _folder(self)
+        study, folder = self.configuration(), results_folder(self)
         records.open_folder(folder, study.identity())
         from experiments.simplification_report import write_report
 
@@ -191,7 +191,7 @@ STUDIES: dict[str, type[Options]] = {
 """Options of the studies by name; the first one is run where none is named."""
 
 
-def _folder(options: Options) -> Path:
+def results_folder(options: Options) -> Path:
     """Where results go."""
     name = f"{options.NAME}-smoke" if options.smoke else options.NAME
     return options.out or Path("results") / name

@@ -321,4 +321,6 @@ def test_a_smoke_run_is_small():
     study = run.PaperOptions(smoke=True).configuration()
     assert study.seeds == 2
     assert study.task("cloth_side_folding").body.num_particles == 81
-    assert run.PaperOptions(smoke=True).folder != run.PaperOptions().folder
+    assert run.results_folder(run.PaperOptions(smoke=True)) != run.results_folder(
+        run.PaperOptions()
+    )
