@@ -17,10 +17,11 @@ from jaxsimp.simplify.cloth_model import Mesh, Points, Triangles, Vector
 DIMENSIONS = 6  # goal x, y, z and rest x, y, z
 LEAST_HEIGHT = 1e-3  # of a triangle at rest, relative to its longest edge
 THIN = 1e-6  # sine of an angle that is as good as none
-SAME = 1e-20  # squared distances that differ by less are equal; a body has the size 1
+SAME = 1e-14  # squared distances that differ by less are equal: more than rounding, at size 1
 LENGTH_WEIGHT = 1e-9  # of an edge's squared length in its price: decides where quadrics are zero
 
-
+# Numba recompiles what is kept on disk when its own file changes, not when a file it calls does:
+# after a change here delete the .nbi and .nbc files in `__pycache__`.
 compiled = njit(cache=True, nogil=True)
 Ids = Int[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "7 7"]

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.body import Body
-from jaxsimp.goals import Positions
+from jaxsimp.goals import Positions, as_goal
 from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
 from jaxsimp.simplify.interpolation import interpolation_weights, model_errors
 from jaxsimp.simplify.keypoints import KeyPoints, Status, smallest_fit
@@ -14,11 +14,14 @@ from jaxsimp.simplify.keypoints import KeyPoints, Status, smallest_fit
 DEFAULT_MAX_SIZE = 24
 
 
-def check_options(body: Body, tolerance: float, max_size: int, least: int) -> None:
-    """Refuse what no method for surfaces can work with.
+def check_surfaces(
+    body: Body, goals: Float[np.ndarray, "B N 3"], tolerance: float, max_size: int, least: int
+) -> Float[np.ndarray, "B N 3"]:
+    """Goals as floats, if a method for surfaces can work with them and the options.
 
     Args:
         body: must have triangles.
+        goals: goal positions, metres, finite for each particle of this body.
         tolerance: must be above zero, metres.
         max_size: must be `least` or more.
         least: the smallest model of the method.
@@ -32,6 +35,10 @@ def check_options(body: Body, tolerance: float, max_size: int, least: int) -> No
         raise ValueError(f"tolerance is {tolerance:g}; give a distance above zero, in metres")
     if max_size < least:
         raise ValueError(f"max_size is {max_size}; at least {least} is needed")
+    checked = np.zeros((len(goals), *body.rest.shape))
+    for index, goal in enumerate(goals):
+        checked[index] = as_goal(body, goal)
+    return checked
 
 
 def boundary(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, " E"]]:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions
-from jaxsimp.simplify.cloth_common import DEFAULT_MAX_SIZE, check_options, fewest_vertices
+from jaxsimp.simplify.cloth_common import DEFAULT_MAX_SIZE, check_surfaces, fewest_vertices
 from jaxsimp.simplify.keypoints import KeyPoints
 
 MIN_TRIANGLES = 2  # where the paper starts
@@ -58,13 +58,13 @@ def simplify_meshlab(
         `NO_FIT` and it is the best of them.
 
     Raises:
-        ValueError: if the body has no triangles, the tolerance is not above zero, or
-            `max_size` is below 4.
+        ValueError: if the body has no triangles, a goal is not one of this body, the tolerance
+            is not above zero, or `max_size` is below 4.
         ImportError: if pymeshlab is not installed.
     """
     tolerance = 0.1 * body.size if tolerance is None else tolerance
     max_size = DEFAULT_MAX_SIZE if max_size is None else max_size
-    check_options(body, tolerance, max_size, MIN_SIZE)
+    goals = check_surfaces(body, goals, tolerance, max_size, MIN_SIZE)
     pymeshlab = _pymeshlab()
     found = []
     for goal in goals:

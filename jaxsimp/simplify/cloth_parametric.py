@@ -18,7 +18,7 @@ from jaxsimp.goals import Positions
 from jaxsimp.simplify.cloth_common import (
     DEFAULT_MAX_SIZE,
     boundary,
-    check_options,
+    check_surfaces,
     inner_edges,
     no_model,
     rest_normals,
@@ -66,13 +66,13 @@ def simplify_parametric(
         `NO_FIT` and it is the best of them.
 
     Raises:
-        ValueError: if the body has no triangles, the tolerance is not above zero, or
-            `max_size` is below 3.
+        ValueError: if the body has no triangles, a goal is not one of this body, the tolerance
+            is not above zero, or `max_size` is below 3.
     """
     scale = float(np.sqrt(np.linalg.norm(rest_normals(body.rest, body.faces), axis=1).sum()))
     tolerance = TOLERANCE * scale if tolerance is None else tolerance
     max_size = DEFAULT_MAX_SIZE if max_size is None else max_size
-    check_options(body, tolerance, max_size, MIN_SIZE)
+    goals = check_surfaces(body, goals, tolerance, max_size, MIN_SIZE)
 
     def one(goal: np.ndarray) -> KeyPoints:
         sheet = _sheet(body, goal, scale)

@@ -17,7 +17,7 @@ from jaxsimp.goals import Positions
 from jaxsimp.simplify.cloth_common import (
     DEFAULT_MAX_SIZE,
     boundary,
-    check_options,
+    check_surfaces,
     fewest_vertices,
     inner_edges,
 )
@@ -62,12 +62,12 @@ def simplify_quadric(
         `NO_FIT` and it is the best of them.
 
     Raises:
-        ValueError: if the body has no triangles, the tolerance is not above zero, or
-            `max_size` is below 4.
+        ValueError: if the body has no triangles, a goal is not one of this body, the tolerance
+            is not above zero, or `max_size` is below 4.
     """
     tolerance = 0.1 * body.size if tolerance is None else tolerance
     max_size = DEFAULT_MAX_SIZE if max_size is None else max_size
-    check_options(body, tolerance, max_size, MIN_SIZE)
+    goals = check_surfaces(body, goals, tolerance, max_size, MIN_SIZE)
     found = []
     for goal in goals:
         meshes = collapse_sequence(goal, follow_creases(body, goal), max_size)

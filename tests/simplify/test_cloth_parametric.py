@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from experiments.ideal_goals import FOLDS, NOISES, add_noise, ideal_goal, is_right
 from jaxsimp import body, goals
-from jaxsimp.simplify import cloth_parametric, simplify
+from jaxsimp.simplify import cloth_parametric, simplify, simplify_meshlab, simplify_quadric
 from jaxsimp.simplify.cloth_common import boundary, rest_normals
 from jaxsimp.simplify.cloth_parametric import simplify_parametric
 from jaxsimp.simplify.interpolation import interpolation_weights
@@ -126,7 +126,7 @@ def test_a_small_part_counts_as_much_as_a_large_one():
         count=900,
     )
     goal = goals.fold(shirt, shirt.rest, np.array([0.75, 0.0]), np.array([0.0, -1.0]))
-    points = robust(shirt, goal, tolerance=0.05)
+    points = robust(shirt, goal, tolerance=0.04)  # without the crease it is off by 0.07
     rest = shirt.rest[points.particles]
     assert points.status == Status.FITS
     assert rest[:, 0].max() > 0.9  # the end of the sleeve
@@ -347,6 +347,20 @@ def test_a_rope_is_refused():
     rope = body.rope()
     with pytest.raises(ValueError, match="the rope has 0 triangles; give a body with triangles"):
         robust(rope, goals.straight(rope))
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("method", [simplify_parametric, simplify_quadric, simplify_meshlab])
+def test_no_method_for_surfaces_takes_goals_of_another_body(method):
+    sheet = cloth(5)
+    goal = goals.flat(sheet)
+    with pytest.raises(ValueError, match=r"the goal has shape \(24, 3\); \(25, 3\) is needed"):
+        method(sheet, goal[None, :24])
+    with pytest.raises(ValueError, match=r"the goal has shape \(3,\); \(25, 3\) is needed"):
+        method(sheet, goal)
+    goal[7, 1] = np.nan
+    with pytest.raises(ValueError, match=r"particle 7 is .* give finite"):
+        method(sheet, np.stack([goals.flat(sheet), goal]))
 
 
 def test_the_entry_takes_a_cloth():
