@@ -1,10 +1,10 @@
 """The step in Taichi on the CPU: a thread runs whole rollouts, sixteen side by side.
 
 Vectors hold a number of sixteen samples each, which compiles to vector instructions; forces are
-added up spring by spring. Measured against it and slower: the samples one by one with springs by
-neighbour (an eighth of the speed on one thread), 8 samples side by side, ndarrays, moving
-particles held apart from the loop over particles, and reciprocal roots by Newton's method; 32
-side by side are 4 % faster and take three times as long to compile.
+added up spring by spring. Measured in turns and slower: samples one by one with springs by
+neighbour, on one thread (about a tenth of the speed), 8 samples side by side, ndarrays instead of
+fields, and reciprocal roots by Newton's method. 32 side by side gain 4 % and take three times as
+long to compile.
 """
 
 import contextlib
