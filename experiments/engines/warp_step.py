@@ -1,8 +1,10 @@
-"""The step in Warp on the CPU: a launch runs whole rollouts, and threads share the samples.
+"""The step in Warp on the CPU: a launch runs whole rollouts, sixteen side by side.
 
-Warp runs a launch on one thread, so each of ours launches its part. Measured against a launch a
-step, and against a form that computes a spring's tension once: on the machine it was
-written on, neither was faster.
+Warp runs a launch on one thread, so each of ours launches its part. Vectors hold a number of
+sixteen samples each, which compiles to vector instructions; forces are added up spring by
+spring. Measured in turns: samples one by one with springs by neighbour have less than a tenth of
+the speed, 8 side by side seven tenths; 32 side by side with -O3 and wider vector instructions
+gain 7 %.
 """
 
 import atexit
@@ -14,7 +16,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from experiments.engines.workload import GRAVITY, Workload, neighbours, num_cores
+from experiments.engines.workload import (
+    GRAVITY,
+    Workload,
+    from_lanes,
+    in_lanes,
+    num_cores,
+    sorted_springs,
+)
+
+LANES = 16
+"""Samples side by side."""
 
 _CACHE = tempfile.TemporaryDirectory()
 atexit.register(_CACHE.cleanup)
@@ -23,6 +35,9 @@ wp.config.kernel_cache_dir = _CACHE.name
 wp.config.log_level = wp.LOG_ERROR
 wp.init()
 wp.set_module_options({"fast_math": True, "enable_backward": False})
+
+
+Lanes = wp.types.vector(length=LANES, dtype=wp.float32)
 
 
 @wp.struct
@@ -35,103 +50,142 @@ class Physics:
     fall: float
     radius: float
     friction: float
-    width: int
     steps: int
-    spring: wp.array2d(dtype=wp.vec3)
-    other: wp.array2d(dtype=wp.int32)
+    ends: wp.array2d(dtype=wp.int32)
+    spring: wp.array(dtype=wp.vec3)
     scale: wp.array(dtype=wp.float32)
     share: wp.array(dtype=wp.float32)
 
 
 @wp.struct
 class Rollouts:
-    """Plans, and the state twice: a step reads one copy and writes the other."""
+    """Plans by block, action, lane and picker; the state by block and particle.
 
-    pick: wp.array3d(dtype=wp.int32)
-    move: wp.array3d(dtype=wp.vec3)
-    x: wp.array3d(dtype=wp.vec3)
-    v: wp.array3d(dtype=wp.vec3)
+    Of the state, 0 to 2 is the position, 3 to 5 the velocity, 6 to 8 the force.
+    """
+
+    pick: wp.array4d(dtype=wp.int32)
+    move: wp.array4d(dtype=wp.vec3)
+    state: wp.array3d(dtype=Lanes)
+
+
+@wp.func
+def inverse_root(squares: Lanes, least: float) -> Lanes:
+    """Of each lane, at most that of `least`."""
+    found = Lanes()
+    for n in range(wp.static(LANES)):
+        found[n] = 1.0 / wp.sqrt(wp.max(squares[n], least))
+    return found
+
+
+@wp.func
+def add_forces(physics: Physics, state: wp.array3d(dtype=Lanes), b: int) -> None:
+    """The forces of all springs on the particles of a block."""
+    for e in range(physics.spring.shape[0]):
+        i, j = physics.ends[e, 0], physics.ends[e, 1]
+        k = physics.spring[e]
+        dx = state[b, j, 0] - state[b, i, 0]
+        dy = state[b, j, 1] - state[b, i, 1]
+        dz = state[b, j, 2] - state[b, i, 2]
+        rate = (
+            wp.cw_mul(dx, state[b, j, 3] - state[b, i, 3])
+            + wp.cw_mul(dy, state[b, j, 4] - state[b, i, 4])
+            + wp.cw_mul(dz, state[b, j, 5] - state[b, i, 5])
+        )
+        squares = wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz)
+        r = inverse_root(squares, physics.floor)
+        tension = Lanes(k[0]) - wp.cw_mul(r, Lanes(k[2]) - k[1] * wp.cw_mul(r, rate))
+        fx, fy, fz = wp.cw_mul(tension, dx), wp.cw_mul(tension, dy), wp.cw_mul(tension, dz)
+        state[b, i, 6] = state[b, i, 6] + fx
+        state[b, i, 7] = state[b, i, 7] + fy
+        state[b, i, 8] = state[b, i, 8] + fz
+        state[b, j, 6] = state[b, j, 6] - fx
+        state[b, j, 7] = state[b, j, 7] - fy
+        state[b, j, 8] = state[b, j, 8] - fz
+
+
+@wp.func
+def accelerate(physics: Physics, state: wp.array3d(dtype=Lanes), b: int) -> None:
+    """New velocities, after contact with the table; the forces are cleared."""
+    for i in range(physics.scale.shape[0]):
+        scale = physics.scale[i]
+        u = state[b, i, 3] * physics.keep + scale * state[b, i, 6]
+        v = state[b, i, 4] * physics.keep + scale * state[b, i, 7]
+        w = state[b, i, 5] * physics.keep + scale * state[b, i, 8] - Lanes(physics.fall)
+        normal = wp.max(w, (Lanes(physics.radius) - state[b, i, 2]) * (1.0 / physics.time_step))
+        slowness = inverse_root(wp.cw_mul(u, u) + wp.cw_mul(v, v), 1.0e-12)
+        lost = physics.friction * wp.cw_mul(normal - w, slowness)
+        kept = wp.max(Lanes(0.0), Lanes(1.0) - lost)
+        state[b, i, 3] = wp.cw_mul(u, kept)
+        state[b, i, 4] = wp.cw_mul(v, kept)
+        state[b, i, 5] = normal
+        for c in range(6, 9):
+            state[b, i, c] = Lanes(0.0)
 
 
 @wp.kernel
 def run_rollouts(physics: Physics, rollouts: Rollouts) -> None:
-    """All rollouts of a launch, each on one thread."""
+    """All rollouts of a launch, a block at a time."""
     b = wp.tid()
-    dt = physics.time_step
-    now = wp.int32(0)
     for a in range(rollouts.pick.shape[1]):
         for s in range(physics.steps):
+            add_forces(physics, rollouts.state, b)
+            accelerate(physics, rollouts.state, b)
+            for n in range(rollouts.pick.shape[2]):
+                for g in range(rollouts.pick.shape[3]):
+                    i = rollouts.pick[b, a, n, g]
+                    moved = rollouts.move[b, a, n, g] * physics.share[s]
+                    for c in range(3):
+                        held = rollouts.state[b, i, 3 + c]
+                        held[n] = moved[c]
+                        rollouts.state[b, i, 3 + c] = held
             for i in range(physics.scale.shape[0]):
-                here = rollouts.x[now, b, i]
-                speed = rollouts.v[now, b, i]
-                force = wp.vec3(0.0, 0.0, 0.0)
-                for n in range(physics.width):
-                    j = physics.other[i, n]
-                    k = physics.spring[i, n]
-                    along = rollouts.x[now, b, j] - here
-                    r = 1.0 / wp.sqrt(wp.max(wp.dot(along, along), physics.floor))
-                    rate = wp.dot(along, rollouts.v[now, b, j] - speed)
-                    force += (k[0] * (1.0 - k[2] * r) + k[1] * rate * r * r) * along
-                free = speed * physics.keep + physics.scale[i] * force
-                fall = free[2] - physics.fall
-                normal = wp.max(fall, (physics.radius - here[2]) / dt)
-                sliding = wp.sqrt(wp.max(free[0] * free[0] + free[1] * free[1], 1.0e-12))
-                kept = wp.max(0.0, 1.0 - physics.friction * (normal - fall) / sliding)
-                moved = wp.vec3(free[0] * kept, free[1] * kept, normal)
-                rollouts.v[1 - now, b, i] = moved
-                rollouts.x[1 - now, b, i] = here + dt * moved
-            for g in range(rollouts.pick.shape[2]):
-                i = rollouts.pick[b, a, g]
-                moved = rollouts.move[b, a, g] * physics.share[s]
-                rollouts.v[1 - now, b, i] = moved
-                rollouts.x[1 - now, b, i] = rollouts.x[now, b, i] + dt * moved
-            now = 1 - now
+                for c in range(3):
+                    change = physics.time_step * rollouts.state[b, i, 3 + c]
+                    rollouts.state[b, i, c] = rollouts.state[b, i, c] + change
 
 
 def prepare(workload: Workload) -> Callable[[], np.ndarray]:
     """A function giving the final positions, shape (B, N, 3), metres."""
     physics = _physics(workload)
-    parts = np.array_split(np.arange(workload.population), num_cores())
-    parts = [part for part in parts if len(part)]
-    starts = [
-        np.broadcast_to(workload.start, (2, len(part), *workload.start.shape)).astype(np.float32)
-        for part in parts
-    ]
-    batches = [_rollouts(workload, part) for part in parts]
-    last = workload.pick.shape[1] * workload.action_steps % 2
+    picks, moves = (in_lanes(each, LANES) for each in (workload.pick, workload.displacement))
+    parts = [part for part in np.array_split(np.arange(len(picks)), num_cores()) if len(part)]
+    batches = [_rollouts(picks[part], moves[part], workload.body.num_particles) for part in parts]
+    at_first = np.zeros((workload.body.num_particles, 9, LANES), np.float32)
+    at_first[:, :3] = workload.start[..., None]
     pool = ThreadPoolExecutor(len(parts))
 
-    def run_part(rollouts: Any, start: np.ndarray) -> np.ndarray:
-        rollouts.x.assign(start)
-        rollouts.v.zero_()
-        wp.launch(run_rollouts, start.shape[1], inputs=[physics, rollouts], device="cpu")
-        return rollouts.x.numpy()[last].copy()
+    def run_part(rollouts: Any) -> np.ndarray:
+        blocks = rollouts.state.shape[0]
+        rollouts.state.assign(np.broadcast_to(at_first, (blocks, *at_first.shape)))
+        wp.launch(run_rollouts, blocks, inputs=[physics, rollouts], device="cpu")
+        return rollouts.state.numpy()[:, :, :3]
+
+    def run() -> np.ndarray:
+        return from_lanes(np.concatenate(list(pool.map(run_part, batches))), workload.population)
 
     wp.load_module(device="cpu")
-    return lambda: np.concatenate(list(pool.map(run_part, batches, starts)))
+    return run
 
 
 def _physics(workload: Workload) -> Any:
-    body, dt, springs = workload.body, workload.time_step, neighbours(workload.body)
-    table = np.stack([springs.stiffness, springs.damping, springs.rest_length], axis=-1)
+    body, dt = workload.body, workload.time_step
+    ends, numbers = sorted_springs(body)
     physics = Physics()
     physics.time_step, physics.floor = dt, workload.shortest**2
     physics.keep, physics.fall = 1 - dt * body.drag, dt * GRAVITY
     physics.radius, physics.friction = body.radius, body.friction
-    physics.width, physics.steps = springs.index.shape[1], workload.action_steps
-    physics.spring, physics.other = _array(table, wp.vec3), _array(springs.index, wp.int32)
+    physics.steps = workload.action_steps
+    physics.ends, physics.spring = _array(ends, wp.int32), _array(numbers, wp.vec3)
     physics.scale = _array(dt / body.mass, wp.float32)
     physics.share = _array(workload.shares / dt, wp.float32)
     return physics
 
 
-def _rollouts(workload: Workload, part: np.ndarray) -> Any:
-    shape = (2, len(part), workload.body.num_particles)
+def _rollouts(pick: np.ndarray, move: np.ndarray, num_particles: int) -> Any:
     rollouts = Rollouts()
-    rollouts.pick = _array(workload.pick[part], wp.int32)
-    rollouts.move = _array(workload.displacement[part], wp.vec3)
-    rollouts.x = wp.zeros(shape, dtype=wp.vec3, device="cpu")
-    rollouts.v = wp.zeros(shape, dtype=wp.vec3, device="cpu")
+    rollouts.pick, rollouts.move = _array(pick, wp.int32), _array(move, wp.vec3)
+    rollouts.state = wp.zeros((len(pick), num_particles, 9), dtype=Lanes, device="cpu")
     return rollouts
 
 

@@ -8,7 +8,7 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from jaxsimp.body import Body, cloth, rope
 from jaxsimp.dynamics import largest_time_step
@@ -163,42 +163,30 @@ def by_offset(body: Body) -> Offsets:
     return Offsets(offsets, table(body.stiffness), table(body.damping), table(body.rest_length))
 
 
-@dataclass(frozen=True, eq=False)
-class Neighbours:
-    """The springs of a body as seen from each particle, filled up with springs of no force.
+def sorted_springs(body: Body) -> tuple[Int[np.ndarray, "S 2"], Float[np.ndarray, "S 3"]]:
+    """Ends of the springs in the order of the particles, for memory's sake, and their numbers.
 
-    Attributes:
-        index: the other end, shape (N, D); the particle itself where there is no spring.
-        stiffness: shape (N, D), newtons per metre.
-        damping: shape (N, D), newton-seconds per metre.
-        rest_length: shape (N, D), metres.
+    The numbers are stiffness, newtons per metre, damping, newton-seconds per metre, and the force
+    stiffness * rest length, newtons.
     """
-
-    index: Int[np.ndarray, "N D"]
-    stiffness: Float[np.ndarray, "N D"]
-    damping: Float[np.ndarray, "N D"]
-    rest_length: Float[np.ndarray, "N D"]
+    order = np.lexsort(np.sort(body.springs, axis=1).T[::-1])
+    numbers = (body.stiffness, body.damping, body.stiffness * body.rest_length)
+    return body.springs[order], np.stack(numbers, axis=-1)[order]
 
 
-def neighbours(body: Body) -> Neighbours:
-    """Every spring twice, once from each end."""
-    here, there = np.concatenate([body.springs, body.springs[:, ::-1]]).T
-    order = np.lexsort((there, here))
-    here, there = here[order], there[order]
-    spring = np.tile(np.arange(len(body.springs)), 2)[order]
-    column = np.arange(len(here)) - np.searchsorted(here, here)
-    width = int(column.max(initial=-1)) + 1
-    index = np.repeat(np.arange(body.num_particles)[:, None], width, axis=1)
-    index[here, column] = there
+def in_lanes(plans: Shaped[np.ndarray, "B T *rest"], lanes: int) -> Shaped[np.ndarray, "..."]:
+    """Plans of blocks of `lanes` samples, shape (blocks, T, lanes, *rest); the last is repeated."""
+    blocks = -(-len(plans) // lanes)
+    filled = plans[np.minimum(np.arange(blocks * lanes), len(plans) - 1)]
+    return filled.reshape(blocks, lanes, *plans.shape[1:]).swapaxes(1, 2)
 
-    def table(values: np.ndarray) -> np.ndarray:
-        filled = np.zeros(index.shape)
-        filled[here, column] = values[spring]
-        return filled
 
-    return Neighbours(
-        index.astype(np.int32), table(body.stiffness), table(body.damping), table(body.rest_length)
-    )
+def from_lanes(
+    positions: Float[np.ndarray, "blocks N 3 lanes"], population: int
+) -> Float[np.ndarray, "B N 3"]:
+    """Positions by sample, without those of repeated plans."""
+    by_sample = np.moveaxis(positions, -1, 1)
+    return by_sample.reshape(-1, *by_sample.shape[2:])[:population]
 
 
 def num_cores() -> int:
