@@ -191,7 +191,8 @@ def _number(error: float) -> float | None:
 def table(models: list[Model]) -> Table:
     """Models for people, a line each."""
     made = Table(title="key points", title_justify="left")
-    for heading in ("goal", "status", "key points", "particles", "tolerance (mm)"):
+    made.add_column("goal", overflow="fold")
+    for heading in ("status", "key points", "particles", "tolerance (mm)"):
         made.add_column(heading)
     for heading in ("largest error (mm)", "rms error (mm)", "certified", "seconds"):
         made.add_column(heading)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxsimp.body import Body
 from jaxsimp.meshes import boundary_edges
-from jaxsimp.simplify import KeyPoints
+from jaxsimp.simplify import KeyPoints, Status
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -193,6 +193,7 @@ def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -
 
 def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
     """A model's error by number of key points, with the tolerance and the number chosen."""
+    chosen = "chosen" if model.status == Status.FITS else "none fits, last tried"
     axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
     axes.axhline(model.tolerance * 1e3, color=GOAL_COLOR, ls="--", label="tolerance")
     axes.plot(
@@ -203,7 +204,7 @@ def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
         mfc="none",
         mec=COLORS[1],
         mew=2,
-        label=f"chosen: {len(model)} key points",
+        label=f"{chosen}: {len(model)} key points",
     )
     axes.set(xlabel="key points", ylabel="model error (mm)")
     axes.set_xticks(np.arange(model.sizes[0], model.sizes[-1] + 1))

@@ -195,5 +195,5 @@ def _upright(points: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "N 2"]:
     return turned if _cross(b - a, c - a) > 0 else turned * np.array([1.0, -1.0])
 
 
-def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray | np.float64:
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
