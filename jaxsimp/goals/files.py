@@ -44,8 +44,18 @@ def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positio
             if body is None:
                 raise ValueError("a mesh does not say how it is at rest; give the body too")
         positions = _rows_of_three("positions", arrays["positions"])
-        made = _body_of(positions, arrays) if body is None else body
-        return made, check_goal(made, positions)
+        if body is not None:
+            return body, check_goal(body, positions)
+        made = _body_of(positions, arrays)
+        try:
+            return made, check_goal(made, positions)
+        except ValueError as error:
+            if "rest" in arrays or "faces" not in arrays:
+                raise
+            raise ValueError(
+                f"{error}. The body was laid flat from this goal, and is too small if creases "
+                f"run across its triangles: add rest, or give the body"
+            ) from error
 
 
 def load_body(path: str | Path) -> Body:
