@@ -46,16 +46,7 @@ def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positio
         positions = _rows_of_three("positions", arrays["positions"])
         if body is not None:
             return body, check_goal(body, positions)
-        made = _body_of(positions, arrays)
-        try:
-            return made, check_goal(made, positions)
-        except ValueError as error:
-            if "rest" in arrays or "faces" not in arrays:
-                raise
-            raise ValueError(
-                f"{error}. The body was laid flat from this goal, and is too small if creases "
-                f"run across its triangles: add rest, or give the body"
-            ) from error
+        return _with_body(positions, arrays)
 
 
 def load_body(path: str | Path) -> Body:
@@ -108,6 +99,20 @@ def _read_arrays(path: str | Path, needed: str) -> dict[str, np.ndarray]:
             f"it has no array {needed!r}; write it with np.savez(path, {needed}={needed})"
         )
     return arrays
+
+
+def _with_body(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> tuple[Body, Positions]:
+    """The body that a file defines, and its goal."""
+    body = _body_of(positions, arrays)
+    try:
+        return body, check_goal(body, positions)
+    except ValueError as error:
+        if "rest" in arrays or "faces" not in arrays:
+            raise
+        raise ValueError(
+            f"{error}. The body was laid flat from this goal, and is too small if creases run "
+            f"across its triangles: add rest, or give the body"
+        ) from error
 
 
 def _body_of(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> Body:
