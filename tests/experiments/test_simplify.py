@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
@@ -151,7 +152,16 @@ def test_a_goal_without_a_model_has_exit_status_1(tmp_path, letters, result, cap
     assert status == 1
     assert (first["status"], second["status"]) == ("FITS", "NO_FIT")
     assert min(second["errors"].values()) >= 2e-3
-    assert "NO_FIT" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "NO_FIT" in told
+    assert "…" not in told  # long paths are folded, not cut
+
+
+def test_sizes_without_a_model_are_null():
+    (model,) = simplify_batch(ROPE, LETTERS["V"][None])
+    none = replace(model, sizes=(2, 3), errors=(np.inf, 0.0))
+    found = simplify.row(simplify.Model(Path("V.npz"), ROPE, LETTERS["V"], none, 1.0))
+    assert found["errors"] == {"2": None, "3": 0.0}
 
 
 # --- many files ----------------------------------------------------------------------------------
@@ -319,6 +329,10 @@ def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys
 def test_wrong_options_are_refused(options, message, letters, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert message in refused(capsys, tmp_path, "V.npz", *options)
+
+
+def test_a_refusal_is_one_line_whatever_the_path(tmp_path, capsys):
+    assert "two lines.npz: it cannot" in refused(capsys, tmp_path, tmp_path / "two\nlines.npz")
 
 
 def test_no_goal_is_refused(tmp_path, capsys):
