@@ -134,8 +134,7 @@ def _scaled_distances(
 
     count = min(num_points, MOST_LANDMARKS)
     landmarks = np.linspace(0, num_points - 1, count).round().astype(int)
-    weights = np.maximum(lengths, 1e-9)  # without length an edge would be none
-    graph = coo_array((weights, edges.T), shape=(num_points,) * 2).tocsr()
+    graph = coo_array((lengths, edges.T), shape=(num_points,) * 2).tocsr()
     squared = dijkstra(graph, directed=False, indices=landmarks) ** 2
     between = squared[:, landmarks]
     means = between.mean(axis=0)
