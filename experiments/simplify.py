@@ -2,42 +2,52 @@
 
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from experiments import records
-from jaxsimp.body import Body, from_mesh
+from jaxsimp.body import Body
 from jaxsimp.goals import Positions, load_goal
-from jaxsimp.meshes import load_mesh
+from jaxsimp.goals.files import load_body
 from jaxsimp.simplify import METHODS, KeyPoints, Status, simplify_batch
 
 NO_MODEL = 1
 """Exit status if some goal has no model within the tolerance."""
 REFUSED = 2
+"""Exit status for wrong input."""
+PICTURES = (".jpg", ".pdf", ".png", ".svg")
+MOST_PICTURED = 40
+"""Most goals in one picture: matplotlib draws up to 65,536 pixels, 500 of them a goal."""
 
 
 @dataclass(frozen=True)
 class Options:
     """Key points of goals: the particles that are worth grasping to reach them.
 
-    A goal is an .npz file with `positions` (N x 3, metres, z up, the table at z = 0) and, as the
-    body's definition, `rest` (N x 2 or N x 3) and `faces` (F x 3); without faces it is a rope.
-    With --body it may also be a mesh file whose points are the body's, in the same order.
-    Goals of one body are one batch.
+    A goal is an .npz file with `positions` (N x 3, metres, z up, the table at z = 0). It may
+    define its body: by `rest` (N x 2 or N x 3) and `faces` (F x 3) a sheet, without faces a
+    rope. Without rest coordinates a rope is straight at rest, and a sheet is flat, its
+    triangles laid out as large as they are in the goal: right to about 1 % where creases
+    lie along edges of the triangles, otherwise short by up to a triangle at each crease.
+
+    With --body a goal may also be a mesh file, whose points are the body's, in its order.
+    Goals of one body are one batch: give --body, or the same rest and faces.
+
+    The exit status is 0, 1 if a goal has no model within the tolerance, 2 for wrong input.
     """
 
     goals: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="GOAL ...")]
     """Files of goals."""
     body: Path | None = None
-    """Mesh file of the body at rest (OBJ, PLY, STL, OFF, GLB, ...), in metres."""
+    """The body at rest: a mesh (OBJ, PLY, STL, OFF, GLB, ...) in metres, or an .npz file with
+    rest, and with faces if it is a sheet."""
     method: str = "robust"
     """How: robust, paper (section III-A), or meshlab (the paper's own tool, an extra)."""
     tolerance: float | None = None
@@ -45,23 +55,44 @@ class Options:
     json: Path | None = None
     """File for the result: an object, or a list of them for several goals."""
     figure: Path | None = None
-    """Picture of the goals with their models."""
+    """Picture (PNG, PDF, SVG, JPG) of the goals with their models and errors by size."""
 
     def check(self) -> None:
         """Refuse what cannot be done, before anything is run.
 
         Raises:
-            ValueError: if there is no goal or no such method, or a path cannot be written to.
+            ValueError: if there is no goal or no such method, the tolerance is not above zero,
+                or a path cannot be written to or is that of another file.
         """
         if not self.goals:
             raise ValueError("no goal is given; name at least one file")
         if self.method not in METHODS:
             raise ValueError(f"unknown method {self.method!r}; choose from {', '.join(METHODS)}")
+        if self.tolerance is not None and not 0 < self.tolerance < np.inf:
+            raise ValueError(f"tolerance is {self.tolerance:g}; give metres, above zero")
+        used = [path.resolve() for path in (*self.goals, self.body) if path]
         for name, path in (("--json", self.json), ("--figure", self.figure)):
-            if path is not None and path.is_dir():
+            if path is None:
+                continue
+            if path.is_dir():
                 raise ValueError(f"{path} is a folder; give a file with {name}")
-            if path is not None and not path.parent.is_dir():
+            if not path.parent.is_dir():
                 raise ValueError(f"{path.parent} is no folder; make it, or give another {name}")
+            if path.resolve() in used:
+                raise ValueError(f"{path} is another file of this command; give another {name}")
+            used.append(path.resolve())
+        if self.figure:
+            _check_figure(self.figure, len(self.goals))
+
+
+def _check_figure(path: Path, num_goals: int) -> None:
+    if path.suffix.lower() not in PICTURES:
+        raise ValueError(f"{path} is no picture; give --figure a file in {', '.join(PICTURES)}")
+    if num_goals > MOST_PICTURED:
+        raise ValueError(
+            f"{num_goals} goals are given; a picture shows {MOST_PICTURED} at most: name fewer, "
+            f"or leave --figure out"
+        )
 
 
 @dataclass(frozen=True)
@@ -89,48 +120,51 @@ def main() -> int:
     console = Console(width=None if sys.stdout.isatty() else 160)  # a file has no width
     try:
         options.check()
-        models = sorted(simplified(options), key=lambda model: options.goals.index(model.path))
-    except ValueError as error:
-        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
+        models = simplified(options)
+        console.print(table(models))
+        if options.json:
+            rows = [row(model) for model in models]
+            records.write_json(options.json, rows[0] if len(rows) == 1 else rows)
+        if options.figure:
+            save_figure(models, options.figure)
+    except (ValueError, OSError) as error:
+        told = " ".join(str(error).split())
+        Console(stderr=True).print(
+            f"error: {told}", style="red", markup=False, highlight=False, soft_wrap=True
+        )
         return REFUSED
-    console.print(table(models))
-    if options.json:
-        rows = [row(model) for model in models]
-        records.write_json(options.json, rows[0] if len(rows) == 1 else rows)
-    if options.figure:
-        save_figure(models, options.figure)
     return 0 if all(model.key_points.status == Status.FITS for model in models) else NO_MODEL
 
 
-def simplified(options: Options) -> Iterator[Model]:
-    """Models of all goals, a batch for each body.
+def simplified(options: Options) -> list[Model]:
+    """Models of all goals in their order, found in a batch for each body.
 
     Raises:
         ValueError: if a file or an option is refused.
     """
-    body = from_mesh(*load_mesh(options.body)) if options.body else None
-    loaded = [(path, *load_goal(path, body)) for path in options.goals]
+    body = load_body(options.body) if options.body else None
+    loaded = [load_goal(path, body) for path in options.goals]
     # Files that define their bodies alike are goals of one body.
-    loaded.sort(key=lambda each: _definition(each[1]))
-    for _, group in groupby(loaded, key=lambda each: _definition(each[1])):
-        paths, bodies, goals = zip(*group, strict=True)
+    batches: dict[tuple[bytes, bytes], list[int]] = {}
+    for index, (made, _) in enumerate(loaded):
+        batches.setdefault((made.rest.tobytes(), made.faces.tobytes()), []).append(index)
+    models: dict[int, Model] = {}
+    for indices in batches.values():
+        made, goals = loaded[indices[0]][0], [loaded[index][1] for index in indices]
         start = time.perf_counter()
         found = simplify_batch(
-            bodies[0], np.stack(goals), method=options.method, tolerance=options.tolerance
+            made, np.stack(goals), method=options.method, tolerance=options.tolerance
         )
         seconds = (time.perf_counter() - start) / len(found)
-        for path, goal, key_points in zip(paths, goals, found, strict=True):
-            yield Model(path, bodies[0], goal, key_points, seconds)
-
-
-def _definition(body: Body) -> tuple[int, bytes, bytes]:
-    return body.num_particles, body.rest.tobytes(), body.faces.tobytes()
+        for index, goal, key_points in zip(indices, goals, found, strict=True):
+            models[index] = Model(options.goals[index], made, goal, key_points, seconds)
+    return [models[index] for index in range(len(loaded))]
 
 
 def row(model: Model) -> dict[str, Any]:
     """A model as JSON."""
     found = model.key_points
-    errors = dict(zip(map(str, found.sizes), found.errors, strict=True))
+    errors = map(_number, found.errors)
     return {
         "goal": str(model.path),
         "status": found.status.name,
@@ -139,27 +173,33 @@ def row(model: Model) -> dict[str, Any]:
         "positions": found.positions.tolist(),
         "method": found.method,
         "tolerance": found.tolerance,
-        "max_error": found.max_error,
-        "rms_error": found.rms_error,
+        "max_error": _number(found.max_error),
+        "rms_error": _number(found.rms_error),
         "certified": found.certified,
-        "errors": {size: error if np.isfinite(error) else None for size, error in errors.items()},
+        "errors": dict(zip(map(str, found.sizes), errors, strict=True)),
         "seconds": model.seconds,
         "num_particles": model.body.num_particles,
         "environment": records.environment(),
     }
 
 
+def _number(error: float) -> float | None:
+    """An error as JSON, which has no infinity: there is no model of that size."""
+    return float(error) if np.isfinite(error) else None
+
+
 def table(models: list[Model]) -> Table:
     """Models for people, a line each."""
     made = Table(title="key points", title_justify="left")
-    for heading in ("goal", "status", "key points", "particles", "tolerance (mm)"):
+    made.add_column("goal", overflow="fold")
+    for heading in ("status", "key points", "particles", "tolerance (mm)"):
         made.add_column(heading)
     for heading in ("largest error (mm)", "rms error (mm)", "certified", "seconds"):
         made.add_column(heading)
     for model in models:
         found = model.key_points
         made.add_row(
-            str(model.path),
+            escape(str(model.path)),
             found.status.name,
             str(len(found)),
             " ".join(map(str, found.particles)),
@@ -173,10 +213,10 @@ def table(models: list[Model]) -> Table:
 
 
 def save_figure(models: list[Model], path: Path) -> None:
-    """A picture of the goals with their models."""
+    """A picture of the goals with their models and errors, a row a goal."""
     import matplotlib.pyplot as plt
 
-    from jaxsimp.viz import plot_models
+    from jaxsimp.viz import plot_simplifications
 
     stems = [model.path.stem for model in models]
     shown = {
@@ -187,11 +227,8 @@ def save_figure(models: list[Model], path: Path) -> None:
             model.key_points,
         )
         for stem, model in zip(stems, models, strict=True)
-        if len(model.key_points)
     }
-    if not shown:
-        return
-    figure = plot_models(shown)
+    figure = plot_simplifications(shown)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 

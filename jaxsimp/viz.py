@@ -8,9 +8,10 @@ from jaxtyping import Float
 
 from jaxsimp.body import Body
 from jaxsimp.meshes import boundary_edges
-from jaxsimp.simplify import KeyPoints
+from jaxsimp.simplify import KeyPoints, Status
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
@@ -28,23 +29,8 @@ def plot_model_errors(models: Mapping[str, KeyPoints]) -> "Figure":
     """
     figure, panels = _panels(models)
     for axes, (name, model) in zip(panels, models.items(), strict=True):
-        axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
-        axes.axhline(model.tolerance * 1e3, color=GOAL_COLOR, ls="--", label="tolerance")
-        axes.plot(
-            len(model),
-            model.error * 1e3,
-            "o",
-            ms=11,
-            mfc="none",
-            mec=COLORS[1],
-            mew=2,
-            label=f"chosen: {len(model)} key points",
-        )
-        axes.set(title=_title(name), xlabel="key points", ylabel="model error (mm)")
-        axes.set_xticks(np.arange(model.sizes[0], model.sizes[-1] + 1))
-        axes.set_xlim(model.sizes[0] - 0.5, model.sizes[-1] + 0.5)
-        axes.set_ylim(bottom=-0.05 * 1e3 * max(*model.errors, model.tolerance))
-        axes.legend(frameon=False)
+        _draw_errors(axes, model)
+        axes.set_title(_title(name))
     return figure
 
 
@@ -56,15 +42,25 @@ def plot_models(models: Mapping[str, tuple[Body, Positions, KeyPoints]]) -> "Fig
     """
     figure, panels = _panels(models, three_d=True)
     for axes, (name, (body, goal, model)) in zip(panels, models.items(), strict=True):
-        draw_body(axes, body, goal, GOAL_COLOR)
-        closed = model.elements[:, [*range(model.elements.shape[1]), 0]]
-        for element in closed if model.elements.shape[1] > 2 else model.elements:
-            axes.plot(*model.positions[element].T, color=COLORS[0], lw=1.5, zorder=5)
-        axes.scatter(
-            *model.positions.T, color=COLORS[1], s=60, marker="*", zorder=6, depthshade=False
-        )
-        _frame(axes, [goal], zoom=0.95)
+        _draw_model(axes, body, goal, model)
         axes.set_title(f"{_title(name)}: {len(model)} key points")
+    return figure
+
+
+def plot_simplifications(models: Mapping[str, tuple[Body, Positions, KeyPoints]]) -> "Figure":
+    """Simplified models over their goals, and their errors by size beside them, a row a goal.
+
+    Args:
+        models: body, goal and key points by the name of the goal.
+    """
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(9.2, 3.3 * len(models)), layout="constrained")
+    for row, (name, (body, goal, model)) in enumerate(models.items()):
+        shown = figure.add_subplot(len(models), 2, 2 * row + 1, projection="3d")
+        _draw_model(shown, body, goal, model)
+        shown.set_title(_title(name))
+        _draw_errors(figure.add_subplot(len(models), 2, 2 * row + 2), model)
     return figure
 
 
@@ -185,6 +181,39 @@ def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> N
         axes.scatter(*positions[[0, -1]].T, color=color, s=25, depthshade=False)
 
 
+def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -> None:
+    """A model over its goal, into 3-D axes."""
+    draw_body(axes, body, goal, GOAL_COLOR)
+    closed = model.elements[:, [*range(model.elements.shape[1]), 0]]
+    for element in closed if model.elements.shape[1] > 2 else model.elements:
+        axes.plot(*model.positions[element].T, color=COLORS[0], lw=1.5, zorder=5)
+    axes.scatter(*model.positions.T, color=COLORS[1], s=60, marker="*", zorder=6, depthshade=False)
+    _frame(axes, [goal], zoom=0.95)
+
+
+def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
+    """A model's error by number of key points, with the tolerance and the number chosen."""
+    chosen = "chosen" if model.status == Status.FITS else "none fits, last tried"
+    axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
+    axes.axhline(model.tolerance * 1e3, color=GOAL_COLOR, ls="--", label="tolerance")
+    axes.plot(
+        len(model),
+        model.error * 1e3,
+        "o",
+        ms=11,
+        mfc="none",
+        mec=COLORS[1],
+        mew=2,
+        label=f"{chosen}: {len(model)} key points",
+    )
+    axes.set(xlabel="key points", ylabel="model error (mm)")
+    axes.set_xticks(np.arange(model.sizes[0], model.sizes[-1] + 1))
+    axes.set_xlim(model.sizes[0] - 0.5, model.sizes[-1] + 0.5)
+    shown = np.array([*model.errors, model.tolerance])
+    axes.set_ylim(bottom=-0.05 * 1e3 * shown[np.isfinite(shown)].max())
+    axes.legend(frameon=False)
+
+
 def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.25) -> None:
     """Equal scales around everything shown, seen from above at an angle, without axes."""
     points = np.concatenate(shown)
@@ -226,4 +255,4 @@ def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Fig
 
 
 def _title(name: str) -> str:
-    return name.replace("_", " ")
+    return name.replace("_", " ").replace("$", r"\$")  # no formulas

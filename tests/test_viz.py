@@ -1,5 +1,7 @@
 """Pictures: what is drawn, from ordinary data and from data with failures in it."""
 
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from scipy import stats
 from jaxsimp import goals, viz
 from jaxsimp.body import cloth, from_mesh, rope
 from jaxsimp.garments import skirt
-from jaxsimp.simplify import KeyPoints
+from jaxsimp.simplify import KeyPoints, Status
 
 
 @pytest.fixture(autouse=True)
@@ -98,6 +100,30 @@ def test_models_are_drawn_over_their_goals():
         "cloth: 4 key points",
         "third: 3 key points",
     ]
+    figure.canvas.draw()
+
+
+def test_simplifications_have_a_row_each_with_errors_beside_the_model():
+    flat, line = cloth((5, 5)), rope(9)
+    none = replace(rope_model(), status=Status.NO_FIT, errors=(np.inf, 0.2))
+    figure = viz.plot_simplifications(
+        {
+            "my_$file$": (flat, goals.flat(flat), cloth_model()),
+            "rope": (line, goals.flat(line), none),
+        }
+    )
+    first, errors, second, others = figure.axes
+    assert (first.name, errors.name, second.name) == ("3d", "rectilinear", "3d")
+    assert [axes.get_title() for axes in (first, second)] == [r"my \$file\$", "rope"]
+    np.testing.assert_allclose(errors.lines[0].get_ydata(), [0.0])
+    assert [text.get_text() for text in others.get_legend().get_texts()] == [
+        "tolerance",
+        "none fits, last tried: 3 key points",
+    ]
+    # The ends of a row are at one height, and the rows below each other.
+    boxes = [axes.get_subplotspec().get_position(figure) for axes in figure.axes]
+    assert boxes[0].y0 == boxes[1].y0 > boxes[2].y0 == boxes[3].y0
+    assert boxes[0].x1 < boxes[1].x0
     figure.canvas.draw()
 
 

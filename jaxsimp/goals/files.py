@@ -1,13 +1,16 @@
 """Goals from files: arrays of positions, or meshes whose points are the body's particles."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from jaxsimp.body import Body, from_mesh, rope_along
 from jaxsimp.goals.check import check_goal
+from jaxsimp.goals.flatten import flatten
 from jaxsimp.goals.shapes import Positions
-from jaxsimp.meshes import read_mesh
+from jaxsimp.meshes import load_mesh, read_mesh
 
 
 def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positions]:
@@ -19,10 +22,11 @@ def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positio
     not welded, and an STL file, which repeats its points, will not match.
 
     Without a body an `.npz` file defines it, with default physics. With `faces` it is
-    `from_mesh(rest, faces)`; without rest coordinates the size of the triangles at rest would
-    be unknown, so they are required. Without `faces` it is a rope: at rest along `rest` if that
-    is given, and otherwise straight, evenly spread by the median distance of neighbours in the
-    goal.
+    `from_mesh(rest, faces)`; without `rest` it is flat at rest, its edges as long as they are in
+    the goal (see `jaxsimp.goals.flatten`): right to about 1 % of its size where creases lie
+    along edges of the triangles, and otherwise short by up to a triangle at each crease.
+    Without `faces` it is a rope: at rest along `rest` if that is given, and otherwise straight,
+    evenly spread by the median distance of neighbours in the goal.
 
     Args:
         path: of the file.
@@ -32,37 +36,83 @@ def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positio
         ValueError: if the file cannot be read or lacks what is needed, the body that it defines
             is refused, or the goal is (see `check_goal`).
     """
-    try:
-        if Path(path).suffix.lower() == ".npz":
-            arrays = _read_arrays(path)
+    with _naming(path):
+        if _is_npz(path):
+            arrays = _read_arrays(path, "positions")
         else:
             arrays = {"positions": read_mesh(path)[0]}
             if body is None:
                 raise ValueError("a mesh does not say how it is at rest; give the body too")
         positions = _rows_of_three("positions", arrays["positions"])
-        made = _body_of(positions, arrays) if body is None else body
-        return made, check_goal(made, positions)
+        if body is not None:
+            return body, check_goal(body, positions)
+        return _with_body(positions, arrays)
+
+
+def load_body(path: str | Path) -> Body:
+    """A body from a file, with default physics.
+
+    An `.npz` file holds `rest`, shape (N, 3), or (N, 2) for a flat body, metres, and `faces`,
+    shape (F, 3), of a sheet; without `faces` it is a rope. Any other file is a mesh at rest
+    (OBJ, PLY, STL, OFF, GLB, ...), in metres; it is cleaned (see `jaxsimp.meshes.clean_mesh`).
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ValueError: if the file cannot be read or lacks what is needed, or the body is refused.
+    """
+    with _naming(path):
+        if not _is_npz(path):
+            return from_mesh(*load_mesh(path))
+        arrays = _read_arrays(path, "rest")
+        return _body_of(_rows_of_three("rest", arrays["rest"]), arrays)
+
+
+def _is_npz(path: str | Path) -> bool:
+    return Path(path).suffix.lower() == ".npz"
+
+
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Put the path before a refusal that does not name it."""
+    try:
+        yield
     except ValueError as error:
         message = str(error)
         named = message.startswith(str(path))
         raise ValueError(message if named else f"{path}: {message}") from error
 
 
-def _read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz` file that make a goal."""
+def _read_arrays(path: str | Path, needed: str) -> dict[str, np.ndarray]:
+    """The arrays of an `.npz` file that make a goal or a body."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in ("positions", "rest", "faces") if name in file}
     except Exception as error:  # np.load raises whatever a broken file makes of it
         raise ValueError(
             f"it cannot be read as .npz ({type(error).__name__}: {error}); write it with "
-            f"np.savez(path, positions=positions)"
+            f"np.savez(path, {needed}={needed})"
         ) from error
-    if "positions" not in arrays:
+    if needed not in arrays:
         raise ValueError(
-            "it has no array 'positions'; write it with np.savez(path, positions=positions)"
+            f"it has no array {needed!r}; write it with np.savez(path, {needed}={needed})"
         )
     return arrays
+
+
+def _with_body(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> tuple[Body, Positions]:
+    """The body that a file defines, and its goal."""
+    body = _body_of(positions, arrays)
+    try:
+        return body, check_goal(body, positions)
+    except ValueError as error:
+        if "rest" in arrays or "faces" not in arrays:
+            raise
+        raise ValueError(
+            f"{error}. The body was laid flat from this goal, and is too small if creases run "
+            f"across its triangles: add rest, or give the body"
+        ) from error
 
 
 def _body_of(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> Body:
@@ -72,15 +122,13 @@ def _body_of(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> Body:
         raise ValueError(f"rest has {len(rest)} rows and positions has {len(positions)}")
     if "faces" not in arrays:
         return rope_along(_straight(positions) if rest is None else rest)
-    if rest is None:
-        raise ValueError(
-            "it has faces but no array 'rest', so the body's size at rest is unknown; add rest, "
-            "or give the body"
-        )
     faces = arrays["faces"]
     if not np.issubdtype(faces.dtype, np.integer):
         raise ValueError(f"faces is of {faces.dtype}; whole numbers are needed, ids of particles")
-    body = from_mesh(rest, faces.astype(np.int64))
+    faces = faces.astype(np.int64)
+    if rest is None:
+        rest = _in_three(flatten(positions, faces))
+    body = from_mesh(rest, faces)
     if body.num_particles != len(positions):
         raise ValueError(
             f"{len(positions) - body.num_particles} of {len(positions)} particles coincide with "
@@ -94,10 +142,21 @@ def _rows_of_three(name: str, array: np.ndarray) -> np.ndarray:
     if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
         raise ValueError(f"{name} is of {array.dtype}; real numbers are needed, in metres")
     if name == "rest" and array.ndim == 2 and array.shape[1] == 2:
-        array = np.concatenate([array, np.zeros((len(array), 1))], axis=1)
+        array = _in_three(array)
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"{name} has shape {array.shape}; one row of x, y, z a particle is needed")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"{name} of particle {bad[0]} is {array[bad[0]].tolist()} ({bad.size} such "
+            f"particles); give finite coordinates in metres"
+        )
     return array.astype(float)
+
+
+def _in_three(flat: np.ndarray) -> np.ndarray:
+    """Flat coordinates with z = 0."""
+    return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
 
 
 def _straight(positions: np.ndarray) -> np.ndarray:
@@ -105,7 +164,7 @@ def _straight(positions: np.ndarray) -> np.ndarray:
     if len(positions) < 2:
         raise ValueError(f"positions has {len(positions)} rows; a rope has at least 2 particles")
     spacing = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
-    if not 0 < spacing < np.inf:
+    if not spacing > 0:
         raise ValueError(
             f"the median distance of neighbours in positions is {spacing:g} m; give particles "
             f"that are apart, in order along the rope"

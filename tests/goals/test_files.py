@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from jaxsimp import goals
 from jaxsimp.body import cloth, rope
 from jaxsimp.garments import t_shirt
+from jaxsimp.goals.files import load_body
 
 CLOTH = cloth((6, 5), (0.3, 0.2))
 FOLDED = goals.fold(CLOTH, goals.flat(CLOTH), np.zeros(2), np.array([0.3, 1.0]))
@@ -85,6 +86,75 @@ def test_positions_alone_define_a_straight_rope(count, length, letter, tmp_path)
     np.testing.assert_allclose(body.mass.sum(), rope().mass.sum(), rtol=1e-12)
 
 
+def test_a_sheet_without_rest_is_laid_flat(tmp_path):
+    line = np.array([0.0, 1.0])  # along the edges of the middle row
+    body = cloth((7, 5), (0.3, 0.2))
+    half = goals.fold(body, goals.flat(body), np.zeros(2), line)
+    path = save(tmp_path / "goal.npz", positions=half, faces=body.faces)
+    made, goal = goals.load_goal(path)
+    np.testing.assert_array_equal(goal, half)
+    np.testing.assert_array_equal(made.faces, body.faces)
+    # A thickness of 4 mm lies on the crease; the long side is along x in both.
+    a, b = made.rest[:, :2], body.rest[:, :2]
+    assert min(np.abs(a - b).max(), np.abs(a + b).max()) < 1e-3
+    np.testing.assert_array_equal(made.rest[:, 2], 0.0)
+
+
+def test_a_sheet_without_rest_is_refused_if_creases_make_it_too_small(tmp_path):
+    path = save(tmp_path / "goal.npz", positions=FOLDED, faces=CLOTH.faces)
+    message = r"only .* m long between them.* laid flat from this goal, .*: add rest, or give"
+    with pytest.raises(ValueError, match=message):
+        goals.load_goal(path)
+    found, _ = goals.load_goal(
+        save(tmp_path / "goal.npz", positions=FOLDED, faces=CLOTH.faces, rest=CLOTH.rest)
+    )
+    np.testing.assert_allclose(found.rest, CLOTH.rest, atol=1e-12)
+
+
+# --- bodies --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "off", "glb"])
+def test_a_mesh_file_is_a_body_at_rest(suffix, tmp_path):
+    path = tmp_path / f"body.{suffix}"
+    trimesh.Trimesh(SHIRT.body.rest, SHIRT.body.faces, process=False).export(path)
+    body = load_body(path)
+    if suffix == "stl":  # its points are those of its triangles, and welded
+        assert (body.num_particles, len(body.faces)) == (150, len(SHIRT.body.faces))
+        return
+    np.testing.assert_array_equal(body.faces, SHIRT.body.faces)
+    np.testing.assert_allclose(body.rest, SHIRT.body.rest, atol=1e-6)  # float32 or 8 digits
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_an_npz_file_is_a_body_at_rest(axes, tmp_path):
+    path = save(tmp_path / "body.npz", rest=CLOTH.rest[:, :axes], faces=CLOTH.faces)
+    body = load_body(path)
+    np.testing.assert_array_equal(body.faces, CLOTH.faces)
+    np.testing.assert_allclose(body.rest, CLOTH.rest, atol=1e-12)
+    line = load_body(save(tmp_path / "rope.npz", rest=rope().rest[:, :axes]))
+    assert (line.name, line.num_particles) == ("rope", 41)
+    np.testing.assert_allclose(line.rest, rope().rest, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"positions": CLOTH.rest}, r"it has no array 'rest'; write it with np\.savez\(path, rest"),
+        ({"rest": CLOTH.rest[:, :1]}, r"rest has shape \(30, 1\)"),
+        ({"rest": CLOTH.rest, "faces": CLOTH.faces + 1}, "a triangle names point 30"),
+        (
+            {"rest": np.concatenate([CLOTH.rest, CLOTH.rest[:2]]), "faces": CLOTH.faces},
+            "2 of 32 particles coincide",
+        ),
+    ],
+)
+def test_a_file_that_is_no_body_is_refused(arrays, message, tmp_path):
+    path = save(tmp_path / "body.npz", **arrays)
+    with pytest.raises(ValueError, match=r"body\.npz: .*" + message):
+        load_body(path)
+
+
 def test_whole_numbers_are_positions_too(tmp_path):
     positions = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]], dtype=np.int32)
     _, goal = goals.load_goal(save(tmp_path / "goal.npz", positions=positions))
@@ -128,7 +198,10 @@ LINE = np.stack([0.1 * np.arange(4), np.zeros(4), np.zeros(4)], axis=1)
         ({"positions": LINE[0]}, r"positions has shape \(3,\)"),
         ({"positions": LINE.astype(str)}, "positions is of <U32; real numbers are needed"),
         ({"positions": LINE.astype(complex)}, "positions is of complex128"),
-        ({"positions": LINE * NAN}, "median distance of neighbours in positions is nan m"),
+        (
+            {"positions": LINE * NAN},
+            r"positions of particle 0 is \[nan, nan, nan\] \(4 such particles\)",
+        ),
         ({"positions": LINE * 0}, r"is 0 m; give particles that are apart, in order"),
         ({"positions": LINE[:1]}, "positions has 1 rows; a rope has at least 2 particles"),
         ({"positions": LINE, "rest": LINE[:3]}, "rest has 3 rows and positions has 4"),
@@ -136,7 +209,14 @@ LINE = np.stack([0.1 * np.arange(4), np.zeros(4), np.zeros(4)], axis=1)
         ({"positions": LINE, "rest": LINE * 0}, "rest_length is 0"),
         ({"positions": LINE - [0, 0, 1.0]}, "goal of particle 0 is 1 m under the table"),
         ({"positions": 2 * LINE, "rest": LINE}, "the rope is only .* m long between them"),
-        ({"positions": FOLDED, "faces": CLOTH.faces}, "it has faces but no array 'rest'"),
+        (
+            {"positions": FOLDED, "faces": CLOTH.faces[:20]},
+            "the sheet must be a disc.* add rest, or give",
+        ),
+        (
+            {"positions": FOLDED, "rest": CLOTH.rest - np.inf, "faces": CLOTH.faces},
+            r"rest of particle 0 is \[-inf",
+        ),
         (
             {"positions": FOLDED, "rest": CLOTH.rest, "faces": CLOTH.faces * 1.0},
             "faces is of float64; whole numbers are needed",
