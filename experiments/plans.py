@@ -62,6 +62,11 @@ BUDGETS = {
         num_actions=15,
         limit=0.08,
     ),
+    "goals": Budget(
+        rope=CEMConfig(num_iterations=24),
+        # Several folds are found one after another: the search must not settle on the first.
+        cloth=CEMConfig(num_iterations=40, smoothing=0.4),
+    ),
     "smoke": Budget(
         rope=CEMConfig(num_iterations=3, population=16, initial_populations=1),
         cloth=CEMConfig(num_iterations=3, population=16, initial_populations=1),
@@ -97,7 +102,7 @@ class Study:
     seeds: int
     quick: bool
     resolution: int | None
-    budget: Literal["default", "paper", "smoke"]
+    budget: Literal["default", "paper", "goals", "smoke"]
     settings: dict[str, Any]
     num_actions: int | None
 

@@ -40,8 +40,8 @@ class PlanOptions:
     """Seeds 0 to SEEDS - 1 of each combination."""
     resolution: int | None = None
     """Particles along the rope or a side of the cloth (default: 41 and 25)."""
-    budget: Literal["default", "paper"] = "default"
-    """Search settings: those that end in minutes, or the paper's own."""
+    budget: Literal["default", "paper", "goals"] = "default"
+    """Search settings: those that end in minutes, the paper's own, or more for several folds."""
     num_iterations: int | None = None
     """CEM rounds, instead of the budget's."""
     population: int | None = None
@@ -140,6 +140,8 @@ class GoalsOptions(PlanOptions):
     """Tasks to plan for."""
     pick_encodings: tuple[str, ...] = ("categorical",)
     """How CEM encodes what is grasped."""
+    budget: Literal["default", "paper", "goals"] = "goals"
+    """Search settings: those that end in minutes, the paper's own, or more for several folds."""
 
 
 @dataclass(frozen=True)

@@ -70,19 +70,19 @@ def _fold_task(
 @register("cloth_letter_fold", full=25, quick=9, group="goals")
 def cloth_letter_fold(resolution: int) -> Task:
     """Fold a square cloth in thirds, like a letter."""
-    return _folds_task("cloth_letter_fold", cloth((resolution, resolution)), "letter", 4)
+    return _folds_task("cloth_letter_fold", cloth((resolution, resolution)), "letter", 6)
 
 
 @register("cloth_quarter_fold", full=25, quick=9, group="goals")
 def cloth_quarter_fold(resolution: int) -> Task:
     """Fold a square cloth in half, and again."""
-    return _folds_task("cloth_quarter_fold", cloth((resolution, resolution)), "quarter", 4)
+    return _folds_task("cloth_quarter_fold", cloth((resolution, resolution)), "quarter", 6)
 
 
 @register("cloth_four_corners", full=25, quick=9, group="goals")
 def cloth_four_corners(resolution: int) -> Task:
     """Fold the four corners of a square cloth to its centre."""
-    return _folds_task("cloth_four_corners", cloth((resolution, resolution)), "four_corners", 4)
+    return _folds_task("cloth_four_corners", cloth((resolution, resolution)), "four_corners", 6)
 
 
 def _folds_task(name: str, body: Body, folds: str, num_actions: int) -> Task:

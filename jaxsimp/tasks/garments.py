@@ -10,7 +10,7 @@ def t_shirt_sleeves_in(resolution: int) -> Task:
     """Turn both sleeves of a T-shirt in."""
     shirt = garments.t_shirt(num_particles=resolution**2)
     goal = goals.fold_sequence(shirt.body, goals.sleeves_in(shirt))
-    return flat_task("t_shirt_sleeves_in", shirt.body, goal, num_actions=2)
+    return flat_task("t_shirt_sleeves_in", shirt.body, goal, num_actions=4)
 
 
 @register("trousers_leg_over_leg", full=25, quick=15, group="goals")
