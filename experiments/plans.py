@@ -38,12 +38,16 @@ class Budget:
 
     rope: CEMConfig
     cloth: CEMConfig
+    garment: CEMConfig | None = None
     num_actions: int | None = None
     limit: float | None = None
 
     def config(self, task: Task) -> CEMConfig:
-        """The search settings for a task's kind of body."""
-        return self.cloth if len(task.body.faces) else self.rope
+        """The search settings for a task's kind of body; a garment's are a cloth's by default."""
+        if not len(task.body.faces):
+            return self.rope
+        is_grid = len(task.body.shape) == 2
+        return self.cloth if is_grid or self.garment is None else self.garment
 
 
 _PAPER = CEMConfig(
@@ -66,6 +70,7 @@ BUDGETS = {
         rope=CEMConfig(num_iterations=24),
         # Several folds are found one after another: the search must not settle on the first.
         cloth=CEMConfig(num_iterations=40, smoothing=0.4),
+        garment=CEMConfig(num_iterations=24),
     ),
     "smoke": Budget(
         rope=CEMConfig(num_iterations=3, population=16, initial_populations=1),
