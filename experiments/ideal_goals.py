@@ -23,12 +23,12 @@ class Line(NamedTuple):
     Attributes:
         point: x and y of a point on it, in half extents of the cloth.
         direction: x and y of its direction, in half extents.
-        layers: number of layers that lie where the cloth is turned over to.
+        height: of the crease, in gaps of layers: half way between the layers that it joins.
     """
 
     point: tuple[float, float]
     direction: tuple[float, float]
-    layers: int = 1
+    height: float = 1.0
 
 
 class Fold(NamedTuple):
@@ -52,11 +52,11 @@ FOLDS = {
     "diagonal": Fold((Line((0, 0), (1, 1)),), ()),
     "other diagonal": Fold((Line((0, 0), (1, -1)),), ()),
     "letter": Fold(
-        (Line((-THIRD, 0), (0, 1)), Line((THIRD, 0), (0, -1), layers=2)),
+        (Line((-THIRD, 0), (0, 1)), Line((THIRD, 0), (0, -1), height=1.5)),
         ((-THIRD, -1), (-THIRD, 1), (THIRD, -1), (THIRD, 1)),
     ),
     "quarter": Fold(
-        (Line((0, 0), (0, 1)), Line((0, 0), (1, 0), layers=2)),
+        (Line((0, 0), (0, 1)), Line((0, 0), (1, 0), height=2.0)),
         ((0, -1), (0, 1), (0, 0), (-1, 0), (1, 0)),
     ),
     "four corners": Fold(
@@ -117,7 +117,7 @@ def partial_folds(
     positions = body.rest + np.array([0.0, 0.0, gap / 2])
     for line in FOLDS[name].lines:
         point, direction = half[:2] * line.point, half[:2] * line.direction
-        positions = rounded_fold(positions, point, direction, line.layers * gap, rounding)
+        positions = rounded_fold(positions, point, direction, line.height * gap, rounding)
         yield positions
 
 

@@ -82,7 +82,9 @@ def inverse_root(squares: Lanes, least: float) -> Lanes:
 def add_forces(physics: Physics, state: wp.array3d(dtype=Lanes), b: int) -> None:
     """The forces of all springs on the particles of a block."""
     for e in range(physics.spring.shape[0]):
-        i, j = physics.ends[e, 0], physics.ends[e, 1]
+        # Apart: unpacked from a tuple, they cost a sixth of the speed.
+        i = physics.ends[e, 0]
+        j = physics.ends[e, 1]
         k = physics.spring[e]
         dx = state[b, j, 0] - state[b, i, 0]
         dy = state[b, j, 1] - state[b, i, 1]
