@@ -78,7 +78,8 @@ def plot_rates(rows: Rows) -> "Figure":
         axes.set(title=KINDS[kind], ylim=(-0.03, 1.03))
         axes.set_xlabel("fold" if kind == "settled" else "noise (mm)")
     panels[0][0].set_ylabel("rate of right key points")
-    panels[0][-1].legend(frameon=False, fontsize="small", loc="lower right")
+    handles, labels = panels[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, loc="outside upper center", ncols=len(labels))
     return figure
 
 

@@ -123,7 +123,7 @@ def main() -> int:
         models = simplified(options)
         console.print(table(models))
         if options.json:
-            rows = [row(model) for model in models]
+            rows = [row(model, options.method) for model in models]
             records.write_json(options.json, rows[0] if len(rows) == 1 else rows)
         if options.figure:
             save_figure(models, options.figure)
@@ -161,7 +161,7 @@ def simplified(options: Options) -> list[Model]:
     return [models[index] for index in range(len(loaded))]
 
 
-def row(model: Model) -> dict[str, Any]:
+def row(model: Model, method: str) -> dict[str, Any]:
     """A model as JSON."""
     found = model.key_points
     errors = map(_number, found.errors)
@@ -171,7 +171,8 @@ def row(model: Model) -> dict[str, Any]:
         "key_points": found.particles.tolist(),
         "num_key_points": len(found),
         "positions": found.positions.tolist(),
-        "method": found.method,
+        "method": method,
+        "algorithm": found.method,
         "tolerance": found.tolerance,
         "max_error": _number(found.max_error),
         "rms_error": _number(found.rms_error),

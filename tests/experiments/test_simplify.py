@@ -35,6 +35,7 @@ SCHEMA = {
     "num_key_points": int,
     "positions": list,
     "method": str,
+    "algorithm": str,
     "tolerance": float,
     "max_error": float,
     "rms_error": float,
@@ -92,7 +93,7 @@ def test_a_rope_is_simplified_as_by_the_library(letters, result):
     assert found["key_points"] == model.particles.tolist()
     assert found["num_key_points"] == len(found["key_points"]) == len(found["positions"]) == 5
     np.testing.assert_allclose(found["positions"], model.positions, atol=1e-9)
-    assert (found["method"], found["certified"]) == (model.method, True)
+    assert (found["algorithm"], found["certified"]) == (model.method, True)
     assert found["tolerance"] == pytest.approx(0.015 * 0.5)
     assert found["errors"] == {str(s): e for s, e in zip(model.sizes, model.errors, strict=True)}
     assert found["errors"]["5"] < found["tolerance"] <= found["errors"]["4"]
@@ -107,7 +108,8 @@ def test_a_folded_cloth_has_its_corners(diagonal, result):
     assert status == 0
     assert {name: type(value) for name, value in found.items()} == SCHEMA
     assert found["key_points"] == CORNERS
-    np.testing.assert_array_equal(found["positions"], DIAGONAL[CORNERS])
+    # The model's corners are fitted to all particles; creases are lifted by 2 mm, a radius.
+    np.testing.assert_allclose(found["positions"], DIAGONAL[CORNERS], atol=0.0021)
     assert found["tolerance"] == pytest.approx(0.03)
 
 
@@ -141,7 +143,7 @@ def test_method_and_tolerance_are_used(letters, result):
     (model,) = simplify_batch(ROPE, LETTERS["M"][None], method="paper", tolerance=0.03)
     _, found = result(letters[1], "--method", "paper", "--tolerance", 0.03)
     assert found["key_points"] == model.particles.tolist()
-    assert (found["method"], found["tolerance"]) == (model.method, 0.03)
+    assert (found["algorithm"], found["tolerance"]) == (model.method, 0.03)
     assert not found["certified"]
 
 
@@ -160,7 +162,7 @@ def test_a_goal_without_a_model_has_exit_status_1(tmp_path, letters, result, cap
 def test_sizes_without_a_model_are_null():
     (model,) = simplify_batch(ROPE, LETTERS["V"][None])
     none = replace(model, sizes=(2, 3), errors=(np.inf, 0.0))
-    found = simplify.row(simplify.Model(Path("V.npz"), ROPE, LETTERS["V"], none, 1.0))
+    found = simplify.row(simplify.Model(Path("V.npz"), ROPE, LETTERS["V"], none, 1.0), "robust")
     assert found["errors"] == {"2": None, "3": 0.0}
 
 
