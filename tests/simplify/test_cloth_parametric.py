@@ -210,9 +210,14 @@ def test_key_points_are_particles_and_the_first_size_that_fits(seed):
     assert (np.diff(points.particles) > 0).all()
     assert np.array_equal(np.unique(points.elements), np.arange(len(points)))
     at = points.sizes.index(len(points))
-    assert points.sizes[: at + 1] == tuple(range(3 if 3 in points.sizes else 4, len(points) + 1))
-    assert points.error < points.tolerance <= min(points.errors[:at], default=np.inf)
-    assert len(points.sizes) - 1 - at <= 3
+    first = 3 if 3 in points.sizes else 4
+    assert points.sizes[: at + 1] == tuple(range(first, len(points) + 1))
+    if points.status == Status.NO_FIT:  # one in fifty is too crumpled for 24 key points
+        assert points.sizes == tuple(range(first, 25))
+        assert points.tolerance <= points.error == min(points.errors)
+    else:
+        assert points.error < points.tolerance <= min(points.errors[:at], default=np.inf)
+        assert len(points.sizes) - 1 - at <= 3
 
 
 def test_the_same_goal_gives_the_same_bits_alone_and_in_a_batch():
