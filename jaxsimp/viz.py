@@ -214,7 +214,7 @@ def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
     axes.legend(frameon=False)
 
 
-def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.25) -> None:
+def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.1) -> None:
     """Equal scales around everything shown, seen from above at an angle, without axes."""
     points = np.concatenate(shown)
     points = points[np.isfinite(points).all(axis=1)]
