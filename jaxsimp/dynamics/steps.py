@@ -134,7 +134,6 @@ def _adjoint_steps(
     segments = _segments(len(shares))
     length = int(np.diff(segments).max(initial=0))
     padded = jnp.pad(shares, (0, length))
-    halo, count = simulation.springs.halo, len(simulation.mass)
 
     def segment(bars: Bars, saved: tuple[Int[Array, " 2"], Packed]) -> tuple[Bars, None]:
         (first, end), packed = saved
@@ -170,19 +169,25 @@ def _adjoint_steps(
 
         return jax.lax.fori_loop(0, end - first, back, (bars, state_at(end - 1)))[0], None
 
-    position_bar, velocity_bar = (
-        [bar[axis, halo : halo + count] for axis in range(3)] for bar in packed_bar
-    )
+    halo, count = simulation.springs.halo, len(simulation.mass)
+    position_bar, velocity_bar = (_rows(bar, halo, count) for bar in packed_bar)
     drive_bar = [jnp.zeros_like(row) for row in motion.drive]
     bars: Bars = simulation_bar, (position_bar, velocity_bar), drive_bar
     bars, _ = jax.lax.scan(segment, bars, (jnp.asarray(segments), starts), reverse=True)
     simulation_bar, (position_bar, velocity_bar), drive_bar = bars
-    padding = ((0, 0), (halo, halo)) + ((0, 0),) * (motion.held.ndim - 1)
-    packed_bar = (
-        jnp.pad(jnp.stack(position_bar), padding),
-        jnp.pad(jnp.stack(velocity_bar), padding),
-    )
-    return simulation_bar, packed_bar, jnp.stack(drive_bar)
+    packed_bar = _stack(position_bar, halo), _stack(velocity_bar, halo)
+    return simulation_bar, packed_bar, _stack(drive_bar, 0)
+
+
+def _rows(array: Float[Array, "3 NHH *B"], halo: int, count: int) -> Axes:
+    """The rows of an array, without halo."""
+    return [array[axis, halo : halo + count] for axis in range(3)]
+
+
+def _stack(rows: Axes, halo: int) -> Float[Array, "3 NHH *B"]:
+    """An array of rows, with a halo of zeros."""
+    padding = ((0, 0), (halo, halo)) + ((0, 0),) * (rows[0].ndim - 1)
+    return jnp.pad(jnp.stack(rows), padding)
 
 
 _steps.defvjp(_forward, _backward, symbolic_zeros=True)

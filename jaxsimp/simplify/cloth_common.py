@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from jaxsimp.body import Body
 from jaxsimp.goals import Positions, as_goal
+from jaxsimp.meshes import half_edges
 from jaxsimp.simplify.hausdorff import Surface, hausdorff_distance
 from jaxsimp.simplify.interpolation import interpolation_weights, model_errors
 from jaxsimp.simplify.keypoints import KeyPoints, Status, smallest_fit
@@ -47,7 +48,7 @@ def boundary(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "E 2"], Int
     Args:
         faces: vertex ids of the triangles, shape (F, 3).
     """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges, _ = half_edges(faces)
     _, index, count = np.unique(
         np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
     )
@@ -65,8 +66,7 @@ def inner_edges(
     Args:
         faces: vertex ids of the triangles, shape (F, 3).
     """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    opposite = faces[:, [2, 0, 1]].T.ravel()
+    edges, opposite = half_edges(faces)
     _, where, count = np.unique(
         np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
     )

@@ -39,8 +39,9 @@ class KeyPoints:
         max_error: largest distance of a particle from the model, metres.
         rms_error: root mean square of those distances, metres.
         certified: whether it is proven that no model with fewer key points fits.
-        status: `FITS`, or why there is no model: where none of the sizes fits it is the last
-            one tried, where constraints contradict each other there are no key points.
+        status: `FITS`, or why no model fits. Where none of the sizes does, this is one that was
+            tried, as the method says; where constraints contradict each other there are no key
+            points.
     """
 
     particles: Int[np.ndarray, " K"]
