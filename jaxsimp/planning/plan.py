@@ -28,6 +28,7 @@ from jaxsimp.dynamics import (
 )
 from jaxsimp.planning.actions import ActionSpace, Encoding
 from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.ensemble import Ensemble, over_members
 from jaxsimp.planning.population import Layout, PopulationMap, default_layout
 from jaxsimp.tasks import Episode, Task, score
 
@@ -70,24 +71,38 @@ class Planner:
         task: what is planned for.
         config: settings of the search.
         layout: of the population on this machine.
+        ensemble: of physics that plans are costed in, if it is not the task's own alone.
         compile_seconds: that compiling the rollouts took.
     """
 
-    def __init__(self, task: Task, config: CEMConfig, layout: Layout | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        config: CEMConfig,
+        layout: Layout | None = None,
+        ensemble: Ensemble | None = None,
+    ) -> None:
         """Compile the task's rollouts for the population of `config`.
 
         Args:
             task: what is planned for.
             config: settings of the search.
             layout: of the population on this machine; by default the one measured to be best.
+            ensemble: of physics that plans are costed in; by default the task's own alone.
+                Plans are executed in the task's own.
         """
-        self.task, self.config = task, config
+        self.task, self.config, self.ensemble = task, config, ensemble
         simulation = task.simulation()
         self._physics = simulation, _pickers(task)
         shared = (self._physics, self._episode(task.episode_fn(0)))
         self.layout = layout or default_layout(config.population, simulation)
         one = jax.tree.map(lambda array: array[:1], self._idle())
-        self._costs = PopulationMap(partial(_plan_cost, task), shared, self._idle(), self.layout)
+        cost_fn: Callable[..., Array] = partial(_plan_cost, task)
+        self._cost_physics = self._physics
+        if ensemble is not None:
+            self._cost_physics, cost_fn = ensemble.physics(task), over_members(cost_fn)
+        costed = (self._cost_physics, shared[1])
+        self._costs = PopulationMap(cost_fn, costed, self._idle(), self.layout)
         self._execution = PopulationMap(partial(_execute, task), shared, one, Layout())
         self.compile_seconds = self._costs.compile_seconds + self._execution.compile_seconds
 
@@ -114,13 +129,12 @@ class Planner:
             self.task.num_actions,
             self.task.num_pickers,
         )
-        shared = (self._physics, self._episode(episode))
         key = jax.random.key(seed)
         start = time.perf_counter()
         once = dataclasses.replace(self.config, num_iterations=1, initial_populations=1)
         search(space, encoding, once, key, lambda actions: np.zeros(len(actions.pick)))
         compiled = time.perf_counter()
-        costs = partial(self._costs, shared)
+        costs = partial(self.costs, episode)
         found = search(space, encoding, self.config, key, costs, on_population)
         return Plan(
             actions=found.actions,
@@ -129,11 +143,21 @@ class Planner:
             compile_seconds=compiled - start,
         )
 
+    def costs(self, episode: Episode, actions: Actions) -> Float[np.ndarray, " B"]:
+        """Costs of plans, at most as many as the population: what the search minimises.
+
+        Args:
+            episode: start and goal.
+            actions: the plans, shapes (B, T, G) and (B, T, G, 3).
+        """
+        costs = self._costs((self._cost_physics, self._episode(episode)), actions)
+        return costs if self.ensemble is None else self.ensemble.cost(costs)
+
     def estimate_seconds(self) -> float:
         """Seconds that a plan takes, from one evaluation of a population that does nothing."""
-        shared = (self._physics, self._episode(self.task.episode_fn(0)))
+        episode = self.task.episode_fn(0)
         start = time.perf_counter()
-        self._costs(shared, self._idle())
+        self.costs(episode, self._idle())
         return (time.perf_counter() - start) * self.config.num_populations
 
     def execute(self, episode: Episode, actions: Actions) -> Execution:
