@@ -58,8 +58,9 @@ class CalibrationConfig:
         parameters: which of `PARAMETERS` are fitted; the others stay the body's.
         steps: of gradient descent (Adam, its learning rate falling to zero as a cosine).
         learning_rate: the first, in natural logarithms of a factor.
-        largest_factor: on a parameter, up or down. All within it must be stable, so the time
-            step gets shorter with the root of it.
+        largest_factor: on a parameter. All below it must be stable, so the time step gets
+            shorter with the root of it.
+        smallest_factor: on a parameter.
 
     Raises:
         ValueError: if a parameter is unknown or a number is out of its range.
@@ -69,6 +70,7 @@ class CalibrationConfig:
     steps: int = 150
     learning_rate: float = 0.1
     largest_factor: float = 5.0
+    smallest_factor: float = 0.01
     longest_time_step: float = LONGEST_TIME_STEP
 
     def __post_init__(self) -> None:
@@ -83,6 +85,10 @@ class CalibrationConfig:
             raise ValueError(f"learning_rate is {self.learning_rate}; give a number above 0")
         if not 1 < self.largest_factor < np.inf:
             raise ValueError(f"largest_factor is {self.largest_factor}; give a number above 1")
+        if not 0 < self.smallest_factor < 1:
+            raise ValueError(
+                f"smallest_factor is {self.smallest_factor}; give a number between 0 and 1"
+            )
         _check_seconds("longest_time_step", self.longest_time_step)
 
 
@@ -117,8 +123,8 @@ def calibrate(
     Minimises the mean squared distance of particles from where they were seen, over the
     logarithms of factors, from factors of 1. The first steps of the descent look at the first
     actions only, and from half way on it looks at all: late motion depends on early motion in
-    ways so intricate that a descent on it alone gets stuck. Masses are taken as they are: forces can be told
-    from a motion only in proportion to them.
+    ways so intricate that a descent on it alone gets stuck. Masses are taken as they are: forces
+    can be told from a motion only in proportion to them.
 
     Args:
         body: the first guess.
@@ -218,7 +224,7 @@ def _descend(
         return jnp.vdot(weights, by_action) / weights.sum(), by_action.mean()
 
     optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps))
-    bound = log(config.largest_factor)
+    low, high = log(config.smallest_factor), log(config.largest_factor)
 
     def step(
         carry: tuple[Any, ...], horizon: Float[Array, ""]
@@ -232,7 +238,7 @@ def _descend(
         updates, state = optimizer.update(gradient, state)
         # From where there is no gradient it goes on from the best.
         logs = optax.apply_updates(_choose(finite, logs, best), updates)
-        logs = jax.tree.map(lambda leaf: jnp.clip(leaf, -bound, bound), logs)
+        logs = jax.tree.map(lambda leaf: jnp.clip(leaf, low, high), logs)
         return (logs, state, best, least), loss
 
     logs = {name: jnp.zeros(num_kinds if name == "stiffness" else ()) for name in config.parameters}

@@ -125,13 +125,14 @@ def test_the_history_and_the_best_physics():
 @pytest.mark.slow
 def test_the_best_is_kept_where_the_descent_goes_astray():
     seen = [motions(TRUE_ROPE, 0, 0.0)]
-    wild = CalibrationConfig(steps=4, learning_rate=1.5, largest_factor=5.0)
+    wild = CalibrationConfig(steps=4, learning_rate=1.5, largest_factor=3.0, smallest_factor=0.5)
     found = calibrate(ROPE, seen, SECONDS, wild)
     assert found.errors[-1] > 1.05 * found.errors.min()
     # Another time step than the descent's: a few per cent of the error.
     assert replay_error(found.body, seen, SECONDS) == pytest.approx(found.errors.min(), rel=0.1)
     for factor in jax.tree.leaves(found.factors):
-        assert (np.abs(np.log(factor)) <= np.log(5.0) * (1 + 1e-6)).all()
+        assert (factor > 0.4999).all()
+        assert (factor < 3.0001).all()
 
 
 def test_a_replay_is_a_rollout():
@@ -261,6 +262,8 @@ def test_what_cannot_be_fitted_is_refused():
         ({"learning_rate": 0.0}, "learning_rate is 0"),
         ({"learning_rate": float("nan")}, "learning_rate is nan"),
         ({"largest_factor": 1.0}, "largest_factor is 1"),
+        ({"smallest_factor": 0.0}, "smallest_factor is 0"),
+        ({"longest_time_step": 0.0}, "longest_time_step is 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings, message):
