@@ -125,14 +125,14 @@ def test_the_history_and_the_best_physics():
 @pytest.mark.slow
 def test_the_best_is_kept_where_the_descent_goes_astray():
     seen = [motions(TRUE_ROPE, 0, 0.0)]
-    wild = CalibrationConfig(steps=4, learning_rate=1.5, largest_factor=3.0, smallest_factor=0.5)
+    wild = CalibrationConfig(steps=2, learning_rate=1.5, largest_factor=1.3, smallest_factor=0.7)
     found = calibrate(ROPE, seen, SECONDS, wild)
-    assert found.errors[-1] > 1.05 * found.errors.min()
+    # Better after the first step, all of whose factors end at a bound, and worse after the second.
+    assert found.errors.argmin() == 1
+    for factor in jax.tree.leaves(found.factors):
+        np.testing.assert_allclose(np.where(factor > 1, 1.3, 0.7), factor, rtol=1e-6)
     # Another time step than the descent's: a few per cent of the error.
     assert replay_error(found.body, seen, SECONDS) == pytest.approx(found.errors.min(), rel=0.1)
-    for factor in jax.tree.leaves(found.factors):
-        assert (factor > 0.4999).all()
-        assert (factor < 3.0001).all()
 
 
 def test_a_replay_is_a_rollout():
