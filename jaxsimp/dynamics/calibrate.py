@@ -211,18 +211,7 @@ def _descend(
     """The best logarithms of factors, and mean squared distances, square metres."""
     import optax
 
-    start = recordings.start.position[:, None]
-    # In units of the motion: Adam's own epsilon is then small.
-    unit = _mean_square(recordings.positions - start)
-
-    def loss_fn(logs: Factors, horizon: Float[Array, ""]) -> tuple[Array, Array]:
-        """The loss up to a horizon, a number of actions, and that of the whole motion."""
-        scaled = _scaled(simulation, table, jax.tree.map(jnp.exp, logs))
-        missed = _replays(steps, scaled, recordings) - recordings.positions
-        by_action = jnp.mean(jnp.sum(missed**2, axis=-1), axis=(0, 2)) / unit
-        weights = jnp.clip(horizon - jnp.arange(len(by_action)), 0.0, 1.0)
-        return jnp.vdot(weights, by_action) / weights.sum(), by_action.mean()
-
+    loss_fn = partial(_misfit, steps, simulation, table, recordings)
     optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps))
     low, high = log(config.smallest_factor), log(config.largest_factor)
 
@@ -248,7 +237,33 @@ def _descend(
     horizons = jnp.clip(jnp.linspace(1.0, 2.0 * num_actions, config.steps), 1.0, num_actions)
     (logs, _, best, least), losses = jax.lax.scan(step, first, horizons)
     last = loss_fn(logs, horizons[-1])[1]
+    unit = _motion(recordings)
     return _choose(last < least, logs, best), jnp.append(losses, last) * unit
+
+
+def _misfit(
+    steps: int,
+    simulation: Simulation,
+    table: Int[Array, "D HN"],
+    recordings: Recording,
+    logs: Factors,
+    horizon: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean squared distance of replays up to a horizon, a number of actions, and of all.
+
+    In units of the motion, so that Adam's own epsilon is small beside it.
+    """
+    scaled = _scaled(simulation, table, jax.tree.map(jnp.exp, logs))
+    missed = _replays(steps, scaled, recordings) - recordings.positions
+    by_action = jnp.mean(jnp.sum(missed**2, axis=-1), axis=(0, 2)) / _motion(recordings)
+    weights = jnp.clip(horizon - jnp.arange(len(by_action)), 0.0, 1.0)
+    return jnp.vdot(weights, by_action) / weights.sum(), by_action.mean()
+
+
+def _motion(recordings: Recording) -> Float[Array, ""]:
+    """Mean squared distance of particles from where they started, square metres."""
+    moved = recordings.positions - recordings.start.position[:, None]
+    return jnp.mean(jnp.sum(moved**2, axis=-1))
 
 
 def _replays(steps: int, simulation: Simulation, recordings: Recording) -> Float[Array, "R T N 3"]:
@@ -367,10 +382,6 @@ def _check_fitted(body: Body, config: CalibrationConfig) -> None:
             f"{zero[0]} of the body is 0, and no factor changes that; start from a number "
             f"above zero, or leave it out of `parameters`"
         )
-
-
-def _mean_square(difference: PyTree[Any]) -> Float[Array, ""]:
-    return jnp.mean(jnp.sum(difference**2, axis=-1))
 
 
 def _choose(condition: Array, first: PyTree[Any], second: PyTree[Any]) -> PyTree[Any]:

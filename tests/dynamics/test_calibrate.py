@@ -4,7 +4,7 @@ A calibration takes seconds to compile, so tests share what they calibrate.
 """
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,13 @@ from jaxsimp.dynamics import (
     replay_error,
     rollout,
 )
-from jaxsimp.dynamics.calibrate import _check_kinds, _kind_table, _scaled, _scaled_body
+from jaxsimp.dynamics.calibrate import (
+    _check_kinds,
+    _kind_table,
+    _misfit,
+    _scaled,
+    _scaled_body,
+)
 
 SECONDS = 0.08
 """Of an action."""
@@ -144,6 +150,35 @@ def test_a_replay_is_a_rollout():
     error = replay_error(TRUE_ROPE, [recording, recording], SECONDS)
     wanted = np.linalg.norm(found[0] - np.asarray(recording.positions), axis=-1)
     assert error == pytest.approx(np.sqrt((wanted**2).mean()), rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("x64")
+def test_the_gradient_is_that_of_finite_differences():
+    # Short, so that it compiles and is smooth: the end of a chain lifted, dragged and let go.
+    actions = Actions(
+        jnp.array([[3], [NONE]]), jnp.array([[[0.02, 0.01, 0.02]], [[0.0, 0.0, 0.0]]])
+    )
+    body = rope(4, 0.1, stretch_stiffness=20.0, bend_stiffness=2.0)
+    stacked = jax.tree.map(
+        lambda leaf: leaf[None],
+        Recording(at_rest(goals.flat(body)), actions, jnp.asarray(body.rest + np.ones((2, 1, 1)))),
+    )
+    kinds = _check_kinds(body, None)
+    loss = partial(_misfit, 30, make_simulation(body, 1e-3), _kind_table(body, kinds), stacked)
+    both = jax.jit(jax.value_and_grad(lambda logs: loss(logs, jnp.asarray(1.6))[0]))
+    at = {"stiffness": jnp.array([0.1, -0.2])}
+    at |= {name: jnp.asarray(0.1) for name in ("damping", "drag", "friction")}
+    _, gradient = both(at)
+    h = 1e-6
+    for name in at:
+        for index in range(at[name].size):
+            step = jnp.zeros(at[name].size).at[index].set(h).reshape(at[name].shape)
+            ends = [float(both(at | {name: at[name] + sign * step})[0]) for sign in (1, -1)]
+            found = float(jnp.ravel(gradient[name])[index])
+            assert abs(found) > 1e-7, name  # it matters
+            # Differences err by h^2, and by 1e-16 / h of a loss near 1.
+            assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(found, rel=1e-4, abs=1e-9), name
 
 
 # --- factors on springs --------------------------------------------------------------------------
