@@ -73,6 +73,7 @@ def test_mjx_moves_springs_as_we_do(name):
     assert max(dataclasses.astuple(found)) < 1e-10
 
 
+@pytest.mark.slow  # MJX compiles for long
 def test_float32_agrees_to_float32():
     body = rope(5)
     found = compare_with_mjx(body, flung(body, 0.5), num_steps=200, time_step=1e-3, gravity=0.0)
@@ -80,6 +81,7 @@ def test_float32_agrees_to_float32():
     assert max(dataclasses.astuple(found)) < 1e-5
 
 
+@pytest.mark.slow  # MJX compiles for long
 def test_what_reaches_the_table_is_not_compared():
     body = rope(5)
     with pytest.raises(
