@@ -2,6 +2,7 @@
 
 from jaxsimp.planning.actions import ENCODINGS, ActionSpace, Categorical, Encoding, GaussianIndex
 from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.engine import Engine, MassSprings
 from jaxsimp.planning.ensemble import Ensemble, Spread, make_ensemble
 from jaxsimp.planning.plan import Execution, Plan, Planner, load_plan, save_plan
 from jaxsimp.planning.population import Layout, PopulationMap, default_layout
@@ -12,10 +13,12 @@ __all__ = [
     "CEMConfig",
     "Categorical",
     "Encoding",
+    "Engine",
     "Ensemble",
     "Execution",
     "GaussianIndex",
     "Layout",
+    "MassSprings",
     "Plan",
     "Planner",
     "PopulationMap",

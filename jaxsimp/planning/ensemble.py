@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp.body import Body
-from jaxsimp.dynamics import Actions, Pickers, Simulation, make_pickers
+from jaxsimp.dynamics import Actions, Pickers, Simulation
 from jaxsimp.tasks import Episode, Task
 
 MOST_REFINEMENT = 4.0
@@ -96,7 +96,7 @@ class Ensemble:
 
     def physics(self, task: Task) -> tuple[Simulation, Pickers]:
         """The stacked simulations, and pickers that take their number of time steps."""
-        return self.simulations, make_pickers(task.limits, steps=self.action_steps)
+        return self.simulations, dataclasses.replace(task.pickers(), steps=self.action_steps)
 
     def cost(self, costs: Float[np.ndarray, "B E"]) -> Float[np.ndarray, " B"]:
         """Cost of each plan from those in the members: not finite if one of them is not."""

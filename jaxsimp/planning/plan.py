@@ -14,20 +14,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from jaxsimp.dynamics import (
-    NONE,
-    Actions,
-    Pickers,
-    Simulation,
-    State,
-    at_rest,
-    make_pickers,
-    rollout,
-)
+from jaxsimp.dynamics import NONE, Actions, State, at_rest
 from jaxsimp.planning.actions import ActionSpace, Encoding
 from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.engine import Engine, MassSprings
 from jaxsimp.planning.ensemble import Ensemble, over_members
 from jaxsimp.planning.population import Layout, PopulationMap, default_layout
 from jaxsimp.tasks import Episode, Task, score
@@ -80,6 +72,7 @@ class Planner:
         task: Task,
         config: CEMConfig,
         layout: Layout | None = None,
+        engine: Engine | None = None,
         ensemble: Ensemble | None = None,
     ) -> None:
         """Compile the task's rollouts for the population of `config`.
@@ -88,22 +81,31 @@ class Planner:
             task: what is planned for.
             config: settings of the search.
             layout: of the population on this machine; by default the one measured to be best.
+            engine: that carries out the plans; by default our own dynamics.
             ensemble: of physics that plans are costed in; by default the task's own alone.
                 Plans are executed in the task's own.
+
+        Raises:
+            ValueError: if the engine refuses the task, or is another's and there is an ensemble.
         """
         self.task, self.config, self.ensemble = task, config, ensemble
-        simulation = task.simulation()
-        self._physics = simulation, _pickers(task)
+        engine = engine or MassSprings()
+        if ensemble is not None and not isinstance(engine, MassSprings):
+            raise ValueError(
+                f"engine is {engine}, and an ensemble is of our own dynamics; leave one of them out"
+            )
+        self._physics = engine.physics(task)
         shared = (self._physics, self._episode(task.episode_fn(0)))
-        self.layout = layout or default_layout(config.population, simulation)
+        self.layout = layout or default_layout(config.population, task.simulation())
         one = jax.tree.map(lambda array: array[:1], self._idle())
-        cost_fn: Callable[..., Array] = partial(_plan_cost, task)
+        cost_fn: Callable[..., Array] = partial(_plan_cost, task, engine)
         self._cost_physics = self._physics
         if ensemble is not None:
             self._cost_physics, cost_fn = ensemble.physics(task), over_members(cost_fn)
         costed = (self._cost_physics, shared[1])
         self._costs = PopulationMap(cost_fn, costed, self._idle(), self.layout)
-        self._execution = PopulationMap(partial(_execute, task), shared, one, Layout())
+        execute = partial(_execute, task, engine)
+        self._execution = PopulationMap(execute, shared, one, Layout())
         self.compile_seconds = self._costs.compile_seconds + self._execution.compile_seconds
 
     def plan(
@@ -180,35 +182,31 @@ class Planner:
         return np.dtype(jnp.result_type(float))
 
 
-def _pickers(task: Task) -> Pickers:
-    return make_pickers(task.limits, steps=task.action_steps)
-
-
 def _plan_cost(
-    task: Task, shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
+    task: Task, engine: Engine, shared: tuple[PyTree[Any], Episode], actions: Actions
 ) -> Float[Array, ""]:
     """Cost of a plan: the sum of the step costs over its actions (paper, IV-A).
 
     The state that is left when the pickers have let go counts as one more step.
     """
-    (simulation, pickers), episode = shared
+    physics, episode = shared
 
     def step_cost(state: State) -> Float[Array, ""]:
         return task.cost_fn(episode, state.position)
 
     start = at_rest(episode.start)
-    _, costs = rollout(simulation, pickers, start, _then_idle(actions, 1), step_cost)
+    _, costs = engine.rollout(physics, start, _then_idle(actions, 1), step_cost)
     return costs.sum()
 
 
 def _execute(
-    task: Task, shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
+    task: Task, engine: Engine, shared: tuple[PyTree[Any], Episode], actions: Actions
 ) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""]]:
     """Positions at the start, after each action and settled, and the score of the last."""
-    (simulation, pickers), episode = shared
+    physics, episode = shared
     start = at_rest(episode.start)
     followed = _then_idle(actions, task.settle_actions)
-    final, positions = rollout(simulation, pickers, start, followed)
+    final, positions = engine.rollout(physics, start, followed, lambda state: state.position)
     during = positions[: task.num_actions]
     positions = jnp.concatenate([start.position[None], during, final.position[None]])
     return positions, score(task, episode, final.position)

@@ -11,7 +11,13 @@ from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.body import Body
-from jaxsimp.dynamics import Simulation, largest_time_step, make_simulation
+from jaxsimp.dynamics import (
+    Pickers,
+    Simulation,
+    largest_time_step,
+    make_pickers,
+    make_simulation,
+)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
@@ -64,6 +70,10 @@ class Task:
     def simulation(self) -> Simulation:
         """The body's simulation, at the task's time step."""
         return make_simulation(self.body, self.time_step)
+
+    def pickers(self) -> Pickers:
+        """How the pickers may move, at the task's time step."""
+        return make_pickers(self.limits, steps=self.action_steps)
 
     @property
     def time_step(self) -> float:

@@ -41,7 +41,7 @@ def ensemble() -> Ensemble:
 
 @lru_cache(None)
 def robust_planner() -> Planner:
-    return Planner(small_task(), CONFIG, LAYOUT, ensemble())
+    return Planner(small_task(), CONFIG, LAYOUT, ensemble=ensemble())
 
 
 jit_rollout = jax.jit(rollout)
@@ -78,7 +78,7 @@ def test_an_ensemble_of_the_body_itself_plans_bit_for_bit_as_without():
     task = small_task()
     episode, candidates = task.episode_fn(0), np.array([0, 4, 8])
     nominal = Planner(task, CONFIG, LAYOUT)
-    one = Planner(task, CONFIG, LAYOUT, make_ensemble(task, size=1))
+    one = Planner(task, CONFIG, LAYOUT, ensemble=make_ensemble(task, size=1))
     np.testing.assert_array_equal(one.costs(episode, plans()), nominal.costs(episode, plans()))
     found, wanted = (
         made.plan(episode, candidates, ENCODINGS["categorical"], 3) for made in (one, nominal)
@@ -146,10 +146,22 @@ def test_a_member_that_is_not_finite_is_counted():
     mass = made.simulations.mass.at[1].set(jnp.nan)
     broken = dataclasses.replace(made, simulations=dataclasses.replace(made.simulations, mass=mass))
     task = small_task()
-    planner = Planner(task, CONFIG, LAYOUT, broken)
+    planner = Planner(task, CONFIG, LAYOUT, ensemble=broken)
     plan = planner.plan(task.episode_fn(0), np.array([0, 8]), ENCODINGS["categorical"], 0)
     assert plan.search.cost == np.inf
     assert plan.search.non_finite == 12  # two rounds of six plans
+
+
+def test_an_ensemble_of_another_engine_is_refused():
+    class Other:
+        def physics(self, task):
+            return ()
+
+        def rollout(self, physics, state, actions, observe):
+            return state, observe(state)
+
+    with pytest.raises(ValueError, match="leave one of them out"):
+        Planner(small_task(), CONFIG, LAYOUT, Other(), ensemble())
 
 
 # --- members -------------------------------------------------------------------------------------
