@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 CONFIG_FILE = "config.json"
-PACKAGES = ("jaxsimp", "jax", "jaxlib", "numpy", "scipy", "optax", "libigl", "proxsuite")
+PACKAGES = "jaxsimp jax jaxlib numpy scipy optax libigl proxsuite mujoco".split()
 
 
 class ResultsError(Exception):

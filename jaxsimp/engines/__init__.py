@@ -1,0 +1,1 @@
+"""The same plan in physics engines that we did not write."""
