@@ -25,12 +25,20 @@ from jaxsimp.engines.flex import Variant, make_model
 from jaxsimp.tasks import Episode, Task, score
 
 
+LEAD = 4
+"""A mocap body has no velocity, so that the constraint brakes what it holds. With the constraint of
+flex.py (critically damped, its time constant two steps) a particle is, after a step of its path,
+just where it should be when the mocap body was four such steps ahead of it."""
+FASTEST = 100.0
+"""Metres per second along an axis: no picker, spring or fall makes a particle this fast."""
+
+
 class ReplayStatus(IntEnum):
     """What became of a plan in MuJoCo.
 
     `WARNED`: it was carried out, and MuJoCo warned of something, as contacts left out.
-    `UNSTABLE`: a position, velocity or acceleration was not finite or too large; the plan ends
-    there.
+    `UNSTABLE`: a position, velocity or acceleration was not finite or too large (see `FASTEST`);
+    the plan ends there.
     """
 
     FINE = 0
@@ -83,9 +91,8 @@ def replay(
         )
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
     model = make_model(task.body, variant, picked)
-    workers = num_workers or len(os.sched_getaffinity(0))
     score_fn = jax.jit(partial(score, task))
-    with ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(num_workers or _num_cores()) as pool:
         return list(pool.map(partial(_replay_one, task, model, score_fn), episodes, plans))
 
 
@@ -110,6 +117,11 @@ def _replay_one(
     return Replay(np.stack(frames), value, status, warnings)
 
 
+def _num_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class _Scene:
     """One simulation and what pickers do in it."""
 
@@ -120,7 +132,8 @@ class _Scene:
         self._data.qpos[:] = (start - task.body.rest).ravel()
         self._steps = max(1, round(task.action_seconds / model.opt.timestep))
         self._pickers = make_pickers(task.limits, steps=self._steps)
-        self._path = np.cumsum(np.asarray(speed_profile(self._steps), dtype=float))
+        speed = np.asarray(speed_profile(self._steps), dtype=float)
+        self._ahead = np.cumsum(speed) + (LEAD - 1) * speed
         self.unstable = False
 
     def positions(self) -> Float[np.ndarray, "N 3"]:
@@ -134,10 +147,10 @@ class _Scene:
         """Carry out one action."""
         start = self.positions()
         held, moves = _grasp(self._task, self._pickers, start, pick, displacement)
-        hold = [(self._picker(i), start[i], moves[i]) for i in np.flatnonzero(held)]
+        hold = [(self._picker(i), start[i], moves[i]) for i in np.flatnonzero(held).tolist()]
         for (constraint, _), _, _ in hold:
             self._data.eq_active[constraint] = 1
-        for share in self._path:
+        for share in self._ahead:
             for (_, mocap), place, move in hold:
                 self._data.mocap_pos[mocap] = place + share * move
             self._step()
@@ -163,7 +176,9 @@ class _Scene:
         if self.unstable:
             return
         mujoco.mj_step(self._model, self._data)
-        self.unstable = any(self._data.warning.number[kind] for kind in _unstable_kinds())
+        warned = any(self._data.warning.number[kind] for kind in _unstable_kinds())
+        # A solver that does not converge makes speeds that are finite, and nonsense.
+        self.unstable = warned or not np.abs(self._data.qvel).max() < FASTEST
 
     def _picker(self, particle: int) -> tuple[int, int]:
         """Constraint and mocap body of a particle."""

@@ -195,16 +195,19 @@ def test_a_hanging_sheet_stretches_as_the_closed_form():
     assert found == pytest.approx(expected, rel=0.06)
 
 
-def test_the_fast_variant_does_not_stretch():
-    body = rope(9, 0.2, drag=20.0)
+def test_the_fast_variant_hardly_stretches():
+    # A rope whose springs would be stretched by half by its own weight.
+    body = rope(9, 0.2, stretch_stiffness=10.0, bend_stiffness=0.0, drag=20.0)
     model = make_model(body, "fast", [0], table=False)
     data = mujoco.MjData(model)
     hold(model, data, body, [0])
     step(model, data, 1.0)
     lengths = np.linalg.norm(np.diff(positions(body, data), axis=0), axis=1)
-    np.testing.assert_allclose(lengths, body.spacing, rtol=2e-3)  # soft constraints
+    # The constraints are soft: with MuJoCo's impedance of 0.9 to 0.95 a tenth of the pull is left
+    # to the reference acceleration, and stretches the uppermost edge by some percent.
+    assert np.all(np.abs(lengths / body.spacing - 1) < 0.04)
     # It is limp, and hangs straight down.
-    assert np.ptp(positions(body, data)[:, 2]) == pytest.approx(0.2, rel=0.02)
+    assert np.ptp(positions(body, data)[:, 2]) == pytest.approx(0.2, rel=0.03)
 
 
 def test_strands_of_a_crossed_rope_lie_on_each_other_only_in_full():
