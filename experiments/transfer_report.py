@@ -14,7 +14,11 @@ from jaxsimp.engines.flex import VARIANTS
 from jaxsimp.planning import load_plan
 
 Rows = list[dict[str, Any]]
-ENGINES = {"ours": "final_score", "MuJoCo fast": "mujoco_fast_score", "MuJoCo full": "mujoco_full_score"}
+ENGINES = {
+    "ours": "final_score",
+    "MuJoCo fast": "mujoco_fast_score",
+    "MuJoCo full": "mujoco_full_score",
+}
 """The column of scores of each engine."""
 LABELS = {"key_points": "key points", "all_particles": "all particles", SCRIPTED: "made by hand"}
 
@@ -44,7 +48,10 @@ def _points(rows: Rows) -> dict[str, np.ndarray]:
     """Scores in ours and in MuJoCo's full variant, a row a plan, by action space."""
     return {
         LABELS[space]: np.array(
-            [[row["final_score"], row["mujoco_full_score"]] for row in _of(rows, action_space=space)],
+            [
+                [row["final_score"], row["mujoco_full_score"]]
+                for row in _of(rows, action_space=space)
+            ],
             dtype=float,
         )
         for space in dict.fromkeys(row["action_space"] for row in rows)
@@ -63,7 +70,9 @@ def _shown(rows: Rows) -> dict[str, dict[str, Any]]:
 def _picture(study: Study, folder: Path, row: dict[str, Any], name: str) -> str:
     """Draw a plan in all engines, a row each; the file's name."""
     task = study.plans.task(row["task"])
-    source = folder if study.source is None or row["action_space"] == SCRIPTED else Path(study.source)
+    source = (
+        folder if study.source is None or row["action_space"] == SCRIPTED else Path(study.source)
+    )
     paths = [source / row["plan"], *(replay_path(folder, row, variant) for variant in VARIANTS)]
     motions = {
         engine: (load_plan(path)[1]["positions"], _score(row, column))

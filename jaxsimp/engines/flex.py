@@ -102,7 +102,11 @@ def bending_rigidity(body: Body) -> float:
 
 
 def make_model(
-    body: Body, variant: str | Variant = "full", graspable: Iterable[int] = (), *, table: bool = True
+    body: Body,
+    variant: str | Variant = "full",
+    graspable: Iterable[int] = (),
+    *,
+    table: bool = True,
 ) -> Any:
     """A body as a compiled `mujoco.MjModel`.
 
@@ -260,7 +264,8 @@ def _add_picker(spec: Any, body: Body, particle: int) -> None:
         name1=f"particle_{particle}",
         name2=name,
         active=False,
-        data=[0.0] * mujoco.mjNEQDATA,  # they meet: the particle's rest coordinates are where both are made
+        data=[0.0]
+        * mujoco.mjNEQDATA,  # they meet: the particle's rest coordinates are where both are made
         # As stiff as the time step allows: what is held follows its picker within 0.1 mm.
         solref=[2 * spec.option.timestep, 1.0],
         solimp=[0.999, 0.9999, 1e-4, 0.5, 2.0],

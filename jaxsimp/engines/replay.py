@@ -24,7 +24,6 @@ from jaxsimp.dynamics.pickers import grasp, speed_profile
 from jaxsimp.engines.flex import Variant, make_model
 from jaxsimp.tasks import Episode, Task, score
 
-
 LEAD = 4
 """A mocap body has no velocity, so that the constraint brakes what it holds. With the constraint of
 flex.py (critically damped, its time constant two steps) a particle is, after a step of its path,
@@ -106,7 +105,9 @@ def _replay_one(
     """Carry out one plan."""
     scene = _Scene(task, model, np.asarray(episode.start, dtype=float))
     frames = [scene.positions()]
-    for pick, displacement in zip(np.asarray(plan.pick), np.asarray(plan.displacement), strict=True):
+    for pick, displacement in zip(
+        np.asarray(plan.pick), np.asarray(plan.displacement), strict=True
+    ):
         scene.act(pick, displacement)
         frames.append(scene.positions())
     scene.rest(task.settle_actions)
@@ -188,9 +189,10 @@ class _Scene:
 
 def _unstable_kinds() -> tuple[int, ...]:
     """Warnings after which the numbers of a simulation mean nothing."""
-    from mujoco import mjtWarning as kinds
+    from mujoco import mjtWarning
 
-    return int(kinds.mjWARN_BADQPOS), int(kinds.mjWARN_BADQVEL), int(kinds.mjWARN_BADQACC)
+    kinds = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)
+    return tuple(map(int, kinds))
 
 
 def _grasp(

@@ -1,4 +1,4 @@
-"""Plans in MuJoCo: pickers go where ours go, failures are a status, nothing depends on the batch."""
+"""Plans in MuJoCo: pickers go where ours go, failures are a status, batches change nothing."""
 
 import dataclasses
 import os
@@ -40,7 +40,8 @@ def plan(*actions):
 def random_plan(task, seed):
     rng = np.random.default_rng(seed)
     pick = rng.integers(-1, task.body.num_particles, (task.num_actions, 2))
-    move = rng.uniform(-0.08, 0.08, (task.num_actions, 2, 3)) + [0.0, 0.0, 0.05]
+    move = rng.uniform(-0.08, 0.08, (task.num_actions, 2, 3))
+    move[..., 2] += 0.05
     return Actions(jnp.asarray(pick), jnp.asarray(move))
 
 
