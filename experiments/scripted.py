@@ -31,10 +31,15 @@ def scripted_plan(task: Task, episode: Episode) -> Actions:
 
 
 def _straighten(task: Task, episode: Episode) -> list[Moves]:
-    """Pull the two ends apart along the table, to where the goal has them."""
-    way = _ways(episode)
-    ends = (0, task.body.num_particles - 1)
-    return [{end: way[end] / task.num_actions for end in ends}] * task.num_actions
+    """Pull the two ends apart along the table, until they are as far as in the goal."""
+    last = task.body.num_particles - 1
+    apart, wanted = (
+        np.asarray(positions, float)[last] - np.asarray(positions, float)[0]
+        for positions in (episode.start, episode.goal)
+    )
+    longer = np.linalg.norm(wanted) / np.linalg.norm(apart) - 1
+    share = longer * apart / 2 / task.num_actions
+    return [{0: -share, last: share}] * task.num_actions
 
 
 def _fold_rope(task: Task, episode: Episode) -> list[Moves]:

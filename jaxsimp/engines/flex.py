@@ -197,6 +197,9 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
     option.solver = mujoco.mjtSolver.mjSOL_CG
     option.tolerance = 1e-6  # moves no particle by 0.1 mm in an action, in less time
     option.timestep = variant.time_step
+    if variant.self_collision:
+        # Layers on each other make thousands of contacts, whose forces hardly change any more.
+        option.iterations = 20
     # What has become unstable must not be reset to a state that looks normal.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if variant.elastic and len(body.faces):
@@ -264,8 +267,7 @@ def _add_picker(spec: Any, body: Body, particle: int) -> None:
         name1=f"particle_{particle}",
         name2=name,
         active=False,
-        data=[0.0]
-        * mujoco.mjNEQDATA,  # they meet: the particle's rest coordinates are where both are made
+        data=[0.0] * mujoco.mjNEQDATA,  # at no offset: both are made where the particle rests
         # As stiff as the time step allows: what is held follows its picker within 0.1 mm.
         solref=[2 * spec.option.timestep, 1.0],
         solimp=[0.999, 0.9999, 1e-4, 0.5, 2.0],
