@@ -39,7 +39,7 @@ class Variant:
 
     Attributes:
         time_step: seconds; an elastic rope, whose springs are integrated explicitly, takes at
-            most half of the largest stable one.
+            most a quarter of the largest stable one.
         elastic: stretches and resists bending as our springs do; or does neither.
         self_collision: layers and strands touch, with friction.
     """
@@ -205,7 +205,7 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
     if variant.elastic and len(body.faces):
         option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     elif variant.elastic:
-        option.timestep = min(variant.time_step, 0.5 * largest_time_step(body))
+        option.timestep = min(variant.time_step, 0.25 * largest_time_step(body))
 
 
 def _add_particle(

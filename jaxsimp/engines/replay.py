@@ -28,8 +28,6 @@ LEAD = 4
 """A mocap body has no velocity, so that the constraint brakes what it holds. With the constraint of
 flex.py (critically damped, its time constant two steps) a particle is, after a step of its path,
 just where it should be when the mocap body was four such steps ahead of it."""
-STILL = 1e-3
-"""Metres per second: a body whose mean speed along an axis is lower has settled."""
 FASTEST = 100.0
 """Metres per second along an axis: no picker, spring or fall makes a particle this fast."""
 
@@ -161,11 +159,9 @@ class _Scene:
             self._data.eq_active[constraint] = 0
 
     def rest(self, num_actions: int) -> None:
-        """Let the time of some actions pass with nothing held, or less when all is still."""
+        """Let the time of some actions pass with nothing held."""
         for _ in range(num_actions * self._steps):
             self._step()
-            if np.abs(self._data.qvel).mean() < STILL:
-                break
 
     def warnings(self) -> tuple[str, ...]:
         """Names of MuJoCo's warnings so far."""
