@@ -134,6 +134,22 @@ def test_a_ring_of_springs_has_about_the_bending_energy_of_the_rod(turn):
     assert energy / rod == pytest.approx(turn**2, rel=0.1)
 
 
+def test_a_sheet_of_springs_bends_as_the_plate_in_the_mean_over_directions():
+    # Each bend spring of a sheet on a cylinder, around which a spring along its circumference
+    # turns by one radian: the spring's own turn goes with the normal curvature, cos^2.
+    body = cloth((9, 9), (0.16, 0.16), shear_stiffness=0.0, bend_stiffness=0.2)
+    length = 0.04  # of every bend spring
+    along = body.rest[body.springs[:, 1]] - body.rest[body.springs[:, 0]]
+    bend = np.isclose(body.rest_length, length)
+    energies = []
+    for angle in np.linspace(0, np.pi, 32, endpoint=False):
+        n = np.array([np.cos(angle), np.sin(angle), 0.0])
+        turn = (along[bend] @ n / length) ** 2
+        energies.append(0.5 * np.sum(body.stiffness[bend] * (length * turn**2 / 8) ** 2) / 0.16**2)
+    plate = 0.5 * flex.bending_rigidity(body) * (2 / length) ** 2
+    assert plate == pytest.approx(np.mean(energies), rel=1e-9)
+
+
 # --- statics --------------------------------------------------------------------------------------
 
 
