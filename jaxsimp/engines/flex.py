@@ -197,7 +197,8 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
     option.timestep = variant.time_step
     if len(body.faces):
         # Newton's method, the default, is exact, and slow with the thousands of contacts of
-        # layers. Twenty iterations instead of a hundred moved the score of a fold by 0.001.
+        # layers. After twenty iterations instead of a hundred, eight folds took half the time
+        # and scored 0.016 more in the mean, 0.033 at most.
         option.solver = mujoco.mjtSolver.mjSOL_CG
         option.tolerance = 1e-6
         option.iterations = 20 if variant.self_collision else 100
