@@ -88,13 +88,16 @@ def test_a_flat_sheet_has_its_corners():
 @settings(max_examples=10)
 def test_key_points_are_particles_where_the_goal_has_them(seed):
     goal = crumpled(np.random.default_rng(seed))
-    points = quadric(cloth(7), goal, tolerance=0.04, max_size=49)  # all of them fit
+    points = quadric(cloth(7), goal, tolerance=0.04, max_size=49)
     assert np.array_equal(points.positions, goal[points.particles])
     assert (np.diff(points.particles) > 0).all()
     assert np.array_equal(np.unique(points.elements), np.arange(len(points)))
     assert points.sizes == tuple(range(points.sizes[0], points.sizes[-1] + 1))
     before = points.errors[: points.sizes.index(len(points))]
-    assert points.error < points.tolerance <= min(before, default=np.inf)
+    # Its edges are those of the collapse, turned: of a goal this crumpled even all particles can
+    # fail to fit.
+    assert points.tolerance <= min(before, default=np.inf)
+    assert (points.error < points.tolerance) == (points.status == Status.FITS)
     model = Surface(points.positions, points.elements)
     original = Surface(goal, cloth(7).faces)
     # Distances from the same samples, written with other vertex ids.
