@@ -21,6 +21,7 @@ LABELS = {
     "all_particles": "all particles",
     "categorical": "categorical",
     "gaussian_index": "Gaussian index",
+    "joint": "joint",
 }
 
 

@@ -69,7 +69,7 @@ BUDGETS = {
     "goals": Budget(
         rope=CEMConfig(num_iterations=24),
         # Several folds are found one after another: the search must not settle on the first.
-        cloth=CEMConfig(num_iterations=40, smoothing=0.4),
+        cloth=CEMConfig(num_iterations=40, smoothing=0.2),
         garment=CEMConfig(num_iterations=24),
     ),
     "smoke": Budget(

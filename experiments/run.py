@@ -34,7 +34,7 @@ class PlanOptions:
     """How goals are simplified: robust, paper or meshlab."""
     action_spaces: tuple[str, ...] = ACTION_SPACES
     """Particles that may be grasped."""
-    pick_encodings: tuple[str, ...] = tuple(ENCODINGS)
+    pick_encodings: tuple[str, ...] = ("categorical", "gaussian_index")
     """How CEM encodes what is grasped."""
     seeds: int = 10
     """Seeds 0 to SEEDS - 1 of each combination."""
@@ -138,7 +138,7 @@ class GoalsOptions(PlanOptions):
 
     tasks: tuple[str, ...] = task_names("goals")
     """Tasks to plan for."""
-    pick_encodings: tuple[str, ...] = ("categorical",)
+    pick_encodings: tuple[str, ...] = ("joint",)
     """How CEM encodes what is grasped."""
     budget: Literal["default", "paper", "goals"] = "goals"
     """Search settings: those that end in minutes, the paper's own, or more for several folds."""

@@ -1,6 +1,13 @@
 """Planning: a task and the particles that may be grasped become a plan."""
 
-from jaxsimp.planning.actions import ENCODINGS, ActionSpace, Categorical, Encoding, GaussianIndex
+from jaxsimp.planning.actions import (
+    ENCODINGS,
+    ActionSpace,
+    Categorical,
+    Encoding,
+    GaussianIndex,
+    Joint,
+)
 from jaxsimp.planning.cem import CEMConfig, Search, search
 from jaxsimp.planning.engine import Engine, MassSprings
 from jaxsimp.planning.ensemble import Ensemble, Spread, make_ensemble
@@ -17,6 +24,7 @@ __all__ = [
     "Ensemble",
     "Execution",
     "GaussianIndex",
+    "Joint",
     "Layout",
     "MassSprings",
     "Plan",

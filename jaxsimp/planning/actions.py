@@ -150,7 +150,8 @@ class ChoiceAndGaussian:
 
     Attributes:
         frequency: of each candidate, and of None, shape (T, G, K + 1).
-        displacement: in units of the limits, shape (T, G, 3).
+        displacement: in units of the limits, shape (T, G, 3), or of each choice,
+            (T, G, K + 1, 3).
     """
 
     frequency: Float[Array, "T G K1"]
@@ -177,12 +178,7 @@ class Categorical:
     ) -> tuple[Int[Array, "num T G"], Float[Array, "num T G 3"]]:
         """Choices and displacements."""
         key_choice, key_move = jax.random.split(key)
-        # By the inverse of the cumulative distribution: one random number a draw, where
-        # `jax.random.categorical` takes one a candidate.
-        cumulative = jnp.cumsum(distribution.frequency, axis=-1)
-        uniform = jax.random.uniform(key_choice, (num, *cumulative.shape[:-1]))
-        drawn = (uniform * cumulative[None, ..., -1])[..., None]
-        choice = jnp.sum(drawn >= cumulative[None, ..., :-1], axis=-1)
+        choice = _draw_choices(distribution.frequency, key_choice, num)
         return choice, distribution.displacement.sample(key_move, num)
 
     def decode(
@@ -213,6 +209,107 @@ class Categorical:
         return distribution.frequency.argmax(axis=-1), distribution.displacement.mean
 
 
+@dataclass(frozen=True)
+class Joint:
+    """What is grasped and where it goes, together: a Gaussian for each candidate in each slot.
+
+    A fold of several corners has many orders; under one Gaussian for all candidates of a slot (an
+    action of a picker), as in `Categorical`, a corner that is tried there later inherits the
+    displacement of another. Candidates with few elites borrow from all elites of the slot
+    (shrinkage: `borrowed` counts as that many elites).
+
+    A search that has settled on some folds no longer tries others, so a share `fresh` of the slots
+    is drawn evenly from all choices and displacements, whatever the distribution (a defensive
+    mixture: Hesterberg, "Weighted average importance sampling and defensive mixture
+    distributions", Technometrics, 1995).
+    """
+
+    name: str = "joint"
+    borrowed: float = 0.5
+    fresh: float = 0.05
+
+    def init(self, space: ActionSpace, spread: float) -> ChoiceAndGaussian:
+        """Every choice equally likely; displacements of mean 0."""
+        shape = (space.num_actions, space.num_pickers, len(space.candidates) + 1)
+        frequency = jnp.full(shape, 1.0 / shape[-1], dtype=float)
+        return ChoiceAndGaussian(frequency, _centred((*shape, 3), spread))
+
+    def sample(
+        self, space: ActionSpace, distribution: ChoiceAndGaussian, key: PRNGKeyArray, num: int
+    ) -> tuple[Int[Array, "num T G"], Float[Array, "num T G 3"]]:
+        """Choices, and displacements of the Gaussians chosen."""
+        key_choice, key_move, key_fresh, key_any, key_anywhere = jax.random.split(key, 5)
+        choice = _draw_choices(distribution.frequency, key_choice, num)
+        gaussian = distribution.displacement
+        noise = jax.random.normal(key_move, (*choice.shape, 3))
+        move = _of_choice(gaussian.mean, choice) + _of_choice(gaussian.spread, choice) * noise
+        fresh = jax.random.bernoulli(key_fresh, self.fresh, choice.shape)
+        anything = jax.random.randint(key_any, choice.shape, 0, len(space.candidates) + 1)
+        anywhere = jax.random.uniform(key_anywhere, move.shape, minval=-1.0, maxval=1.0)
+        choice = jnp.where(fresh, anything, choice)
+        return choice, jnp.where(fresh[..., None], anywhere, jnp.clip(move, -1.0, 1.0))
+
+    def decode(
+        self, space: ActionSpace, sample: tuple[Int[Array, "*B T G"], Float[Array, "*B T G 3"]]
+    ) -> Actions:
+        """Scale the displacement."""
+        return space.actions(*sample)
+
+    def update(
+        self,
+        space: ActionSpace,
+        distribution: ChoiceAndGaussian,
+        elites: tuple[Int[Array, "E T G"], Float[Array, "E T G 3"]],
+        smoothing: float,
+    ) -> ChoiceAndGaussian:
+        """Frequencies of the elites, and moments of those that made each choice."""
+        choice, move = elites
+        chosen = jax.nn.one_hot(choice, len(space.candidates) + 1, dtype=move.dtype)
+        count = chosen.sum(axis=0)[..., None]
+
+        def average(values: Float[Array, "E T G 3"]) -> Float[Array, "T G K1 3"]:
+            own = jnp.einsum("etgk,etga->tgka", chosen, values)
+            every = values.mean(axis=0)[:, :, None]
+            return (own + self.borrowed * every) / (count + self.borrowed)
+
+        mean, square = average(move), average(move**2)
+        spread = jnp.sqrt(jnp.maximum(square - mean**2, 0.0))
+        gaussian = distribution.displacement
+        return ChoiceAndGaussian(
+            _blend(distribution.frequency, chosen.mean(axis=0), smoothing),
+            Gaussian(
+                _blend(gaussian.mean, mean, smoothing), _blend(gaussian.spread, spread, smoothing)
+            ),
+        )
+
+    def mean(
+        self, space: ActionSpace, distribution: ChoiceAndGaussian
+    ) -> tuple[Int[Array, "T G"], Float[Array, "T G 3"]]:
+        """The likeliest choices with their mean displacements."""
+        choice = distribution.frequency.argmax(axis=-1)
+        return choice, _of_choice(distribution.displacement.mean, choice[None])[0]
+
+
+def _draw_choices(
+    frequency: Float[Array, "T G K1"], key: PRNGKeyArray, num: int
+) -> Int[Array, "num T G"]:
+    """Choices by the inverse of the cumulative distribution.
+
+    One random number a draw, where `jax.random.categorical` takes one a candidate.
+    """
+    cumulative = jnp.cumsum(frequency, axis=-1)
+    uniform = jax.random.uniform(key, (num, *cumulative.shape[:-1]))
+    drawn = (uniform * cumulative[None, ..., -1])[..., None]
+    return jnp.sum(drawn >= cumulative[None, ..., :-1], axis=-1)
+
+
+def _of_choice(
+    values: Float[Array, "T G K1 3"], choice: Int[Array, "num T G"]
+) -> Float[Array, "num T G 3"]:
+    """The values of what was chosen in each slot."""
+    return jnp.take_along_axis(values[None], choice[..., None, None], axis=-2)[..., 0, :]
+
+
 def _centred(shape: tuple[int, ...], spread: float) -> Gaussian:
     # With a dtype, or the first update would compile for one type and the next for another.
     return Gaussian(jnp.zeros(shape, dtype=float), jnp.full(shape, spread, dtype=float))
@@ -223,6 +320,6 @@ def _blend(old: Array, new: Array, smoothing: float) -> Array:
 
 
 ENCODINGS: dict[str, Encoding] = {
-    encoding.name: encoding for encoding in (Categorical(), GaussianIndex())
+    encoding.name: encoding for encoding in (Categorical(), GaussianIndex(), Joint())
 }
 """The pick encodings by name."""

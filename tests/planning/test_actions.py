@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsimp.dynamics import NONE
-from jaxsimp.planning import ENCODINGS, ActionSpace, Categorical, GaussianIndex
+from jaxsimp.planning import ENCODINGS, ActionSpace, Categorical, GaussianIndex, Joint
 from jaxsimp.planning.actions import ChoiceAndGaussian, Gaussian
 
 LIMITS = (0.1, 0.2, 0.05)
@@ -231,4 +231,63 @@ def test_encodings_are_registered_under_their_names():
     assert {name: encoding.name for name, encoding in ENCODINGS.items()} == {
         "categorical": "categorical",
         "gaussian_index": "gaussian_index",
+        "joint": "joint",
     }
+
+
+def joint_elites():
+    """Three of candidate 5, each moved alike, and one of None, in one slot."""
+    choice = jnp.array([0, 0, 0, 2])[:, None, None]
+    move = jnp.array([[0.1, 0.2, 0.3]] * 3 + [[-0.9, -0.8, -0.7]])[:, None, None]
+    return choice, move
+
+
+def test_joint_update_weighs_the_elites_of_a_choice_and_all_elites():
+    space = space_of([5, 6], num_actions=1, num_pickers=1)
+    encoding = Joint(borrowed=0.5)
+    choice, move = joint_elites()
+    found = encoding.update(space, encoding.init(space, 0.7), (choice, move), 0.0)
+    np.testing.assert_allclose(found.frequency[0, 0], [0.75, 0.0, 0.25])
+    every, moves = np.asarray(move).mean(axis=0)[0, 0], np.asarray(move)[:, 0, 0]
+    for option in range(3):
+        # The moments of a sample in which all elites together count as half an elite.
+        own = np.asarray(choice)[:, 0, 0] == option
+        weight = own + 0.5 / 4
+        mean = np.average(moves, axis=0, weights=weight)
+        spread = np.sqrt(np.average((moves - mean) ** 2, axis=0, weights=weight))
+        rounding = {"rtol": 1e-5, "atol": 1e-6}  # float32, of numbers below one
+        np.testing.assert_allclose(found.displacement.mean[0, 0, option], mean, **rounding)
+        np.testing.assert_allclose(found.displacement.spread[0, 0, option], spread, **rounding)
+    np.testing.assert_allclose(found.displacement.mean[0, 0, 1], every, rtol=1e-6)
+
+
+def test_joint_draws_are_those_of_the_choice_but_for_a_fresh_share():
+    space = space_of([5, 6], num_actions=1, num_pickers=1)
+    mean = jnp.array([[[[0.5, 0.5, 0.5], [-0.5, -0.5, -0.5], [0.0, 0.0, 0.0]]]])
+    distribution = ChoiceAndGaussian(
+        jnp.array([[[0.5, 0.5, 0.0]]]), Gaussian(mean, jnp.full_like(mean, 1e-3))
+    )
+    count, fresh = 20_000, 0.1
+    sample = Joint(fresh=fresh).sample(space, distribution, jax.random.key(0), count)
+    choice, move = (np.asarray(each)[:, 0, 0] for each in sample)
+    settled = np.abs(move - np.asarray(mean)[0, 0][choice]).max(axis=1) < 0.01
+    # Binomial: five deviations.
+    slack = 5 * np.sqrt(fresh * (1 - fresh) / count)
+    assert abs((~settled).mean() - fresh) < slack
+    assert abs((choice == 2).mean() - fresh / 3) < slack  # what no elite chose
+    anywhere = move[~settled]
+    assert np.abs(anywhere.mean(axis=0)).max() < 5 / np.sqrt(3 * len(anywhere))
+    assert anywhere.std(axis=0) == pytest.approx(np.sqrt(1 / 3), abs=0.05)
+    settled_alone, _ = Joint(fresh=0.0).sample(space, distribution, jax.random.key(1), 1000)
+    assert set(np.asarray(settled_alone).ravel()) == {0, 1}
+
+
+def test_mean_of_a_joint_is_the_likeliest_choice_with_its_own_mean():
+    space = space_of([5, 6], num_actions=1, num_pickers=1)
+    mean = jnp.arange(9.0).reshape(1, 1, 3, 3) / 10
+    distribution = ChoiceAndGaussian(
+        jnp.array([[[0.2, 0.7, 0.1]]]), Gaussian(mean, jnp.ones_like(mean))
+    )
+    choice, move = Joint().mean(space, distribution)
+    assert choice.tolist() == [[1]]
+    np.testing.assert_array_equal(move, mean[:, :, 1])
