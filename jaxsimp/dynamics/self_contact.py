@@ -1,0 +1,231 @@
+"""Self-contact: layers of a body rest on each other, and rub.
+
+A particle of a sheet stands for a disc in the sheet's plane, one of a rope for a piece of its
+line. Each touches at most one other on either side: the nearest that is not its neighbour in the
+body (see nearest.py). A contact keeps the direction that it was found with, from one particle to
+the other and square to both sheets or lines, until all are looked up again. That is when a
+particle may move farther than its distance from what it does not touch allows.
+
+Contact acts every `interval` time steps on velocities, as impulses that are inelastic and look
+ahead (nobody approaches faster than would close the gap within the interval), with Coulomb
+friction, and on positions, where particles are closer than the thickness. Particles in several
+contacts share their mass out among them (mass splitting: Tonge, Benevolenski and Voroshilov,
+"Mass Splitting for Jitter-Free Parallel Rigid Body Simulation", 2012), so that one pass in
+parallel does not overshoot.
+"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsimp.dynamics.layers import SelfContact
+from jaxsimp.dynamics.nearest import nearest_above
+
+
+UPRIGHT = 0.3
+"""Vertical part of its normal from which on a sheet counts as upright."""
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["partner", "direction", "listed", "found_at", "allowance", "missed"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class Contacts:
+    """Who may touch whom.
+
+    Attributes:
+        partner: particle ids, for each side looked at, shape (E, N).
+        direction: of unit length, from the partner, shape (3, E, N).
+        listed: whether there is a partner, shape (E, N).
+        found_at: positions when they were looked up, shape (3, N), metres.
+        allowance: how far each may move from there, shape (N,), metres.
+        missed: contacts so far whose particles got past each other within an interval.
+    """
+
+    partner: Int[Array, "E N"]
+    direction: Float[Array, "3 E N"]
+    listed: Bool[Array, "E N"]
+    found_at: Float[Array, "3 N"]
+    allowance: Float[Array, " N"]
+    missed: Int[Array, ""]
+
+
+def find_contacts(
+    settings: SelfContact, position: Float[Array, "3 N"], missed: Int[Array, ""]
+) -> Contacts:
+    """Look up who may touch whom. Ids count as constants in derivatives, directions do not."""
+    still = jax.lax.stop_gradient
+    across = _across(settings, position)
+    stretch = jnp.sqrt(1 + settings.squash)
+    touching = jnp.hypot(settings.lateral, stretch * settings.thickness)
+    reach = jnp.hypot(settings.lateral, stretch * (settings.thickness + settings.margin))
+
+    def look(normal: Float[Array, "3 N"], one_sided: Bool[Array, " N"]) -> tuple[Array, Array]:
+        return nearest_above(
+            still(position),
+            normal,
+            one_sided,
+            settings.apart,
+            adjacent=settings.adjacent,
+            squash=settings.squash,
+            reach=reach,
+        )
+
+    found = [look(*side) for side in _sides(settings, still(across))]
+    partner, distance = (jnp.stack(each) for each in zip(*found, strict=True))
+    away = position[:, None] - position[:, partner]
+    direct = _directions_of_sheets if settings.is_sheet else _directions_of_lines
+    direction = direct(settings.thickness, away, across[:, None], across[:, partner])
+    free = (distance.min(axis=0) - touching) / (2.0 * stretch)
+    return Contacts(
+        partner=partner,
+        direction=direction,
+        listed=partner != jnp.arange(position.shape[1])[None],
+        found_at=still(position),
+        allowance=jnp.maximum(settings.slack, free),
+        missed=missed,
+    )
+
+
+def renew(
+    settings: SelfContact,
+    contacts: Contacts,
+    position: Float[Array, "3 N"],
+    velocity: Float[Array, "3 N"],
+    seconds: Float[Array, ""],
+) -> Contacts:
+    """The contacts, looked up again if a particle may go too far in the time to come."""
+    moved = jax.lax.stop_gradient(position) - contacts.found_at
+    coming = seconds * jax.lax.stop_gradient(velocity)
+    far = jnp.sqrt(_dot(moved, moved)) + jnp.sqrt(_dot(coming, coming)) > contacts.allowance
+    return jax.lax.cond(
+        far.any(),
+        lambda: find_contacts(settings, position, contacts.missed),
+        lambda: contacts,
+    )
+
+
+def resolve(
+    settings: SelfContact,
+    contacts: Contacts,
+    inverse_mass: Float[Array, " N"],
+    floor: Float[Array, ""],
+    seconds: Float[Array, ""],
+    position: Float[Array, "3 N"],
+    velocity: Float[Array, "3 N"],
+) -> tuple[Contacts, Float[Array, "3 N"], Float[Array, "3 N"]]:
+    """Positions and velocities after contact, and the contacts with the count of those missed.
+
+    Args:
+        settings: of the body.
+        contacts: that were looked up.
+        inverse_mass: 1 / kilograms, 0 for a particle that is held.
+        floor: height below which no particle is pushed, metres.
+        seconds: until contact acts again.
+        position: metres.
+        velocity: metres per second.
+    """
+    partner, along = contacts.partner, contacts.direction
+    rows = jnp.concatenate([position, velocity, inverse_mass[None]])
+    theirs = rows[:, partner]
+    away, speed = rows[:3, None] - theirs[:3], rows[3:6, None] - theirs[3:6]
+    distance, approach = _dot(along, away), _dot(along, speed)
+    beside = _dot(away, away) - distance * distance
+    gap = distance - settings.thickness
+    lacking = -jnp.maximum(gap, 0.0) / seconds - approach
+    near = contacts.listed & (beside < settings.lateral**2)
+    touches = near & ((gap < 0.0) | (lacking > 0.0))
+    shares = touches.sum(axis=0).astype(position.dtype)
+    shares = shares.at[partner].add(touches.astype(position.dtype))
+    mine, yours = (inverse_mass * shares)[None], theirs[6] * shares[partner]
+    both = mine + yours
+    # Zero where both particles are held, or nothing touches.
+    per = jnp.where(touches & (both > 0.0), 1.0 / jnp.where(both > 0.0, both, 1.0), 0.0)
+    impulse = per * jnp.maximum(lacking, 0.0)
+    sliding = speed - approach * along
+    squared = jnp.maximum(_dot(sliding, sliding), 1e-12)
+    rub = jnp.minimum(per, settings.friction * impulse * jax.lax.rsqrt(squared))
+    push = per * jnp.clip(-gap, 0.0, settings.thickness)
+    change = jnp.concatenate([push * along, impulse * along - rub * sliding])
+    total = change.sum(axis=1).at[:, partner].add(-change)
+    total = inverse_mass * total
+    pushed = position + total[:3]
+    pushed = pushed.at[2].max(jnp.minimum(position[2], floor))
+    missed = contacts.missed + (near & (distance < 0.0)).sum()
+    return replace(contacts, missed=missed), pushed, velocity + total[3:]
+
+
+def _sides(
+    settings: SelfContact, across: Float[Array, "3 N"]
+) -> list[tuple[Float[Array, "3 N"], Bool[Array, " N"]]]:
+    """The sides that partners are looked for on: normals, and whether only there.
+
+    In a sheet it is the upper side: so layers that lie on each other are found from the lower
+    one. Where a sheet is nearly upright it is either side. Around a rope there is room for more:
+    it is above and below.
+    """
+    count = across.shape[1]
+    if settings.is_sheet:
+        tilt = across[2]
+        return [(jnp.where(tilt < 0.0, -across, across), jnp.abs(tilt) > UPRIGHT)]
+    upwards = jnp.zeros_like(across).at[2].set(1.0)
+    return [(upwards, jnp.ones(count, bool)), (-upwards, jnp.ones(count, bool))]
+
+
+def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+    """Unit normals of a sheet, or tangents of a rope."""
+    a, b, c, d = (position[:, ids] for ids in settings.frame)
+    across = jnp.cross(a - b, c - d, axis=0) if settings.is_sheet else a - b
+    return _unit(across, jnp.zeros_like(across).at[2].set(1.0))
+
+
+def _directions_of_sheets(
+    thickness: Float[Array, ""],
+    away: Float[Array, "3 E N"],
+    mine: Float[Array, "3 1 N"],
+    yours: Float[Array, "3 E N"],
+) -> Float[Array, "3 E N"]:
+    """Along both normals, each turned to point away from the partner.
+
+    Where the partner is beside the particle and not above or below it, straight away from it.
+    """
+    above, below = _dot(mine, away), _dot(yours, away)
+    bisector = jnp.where(above < 0, -mine, mine) + jnp.where(below < 0, -yours, yours)
+    straight = _unit(away, jnp.zeros_like(away).at[2].set(1.0))
+    beside = jnp.maximum(jnp.abs(above), jnp.abs(below)) < 0.3 * thickness
+    folded = _dot(bisector, bisector) < 1.0
+    return jnp.where(beside | folded, straight, _unit(bisector, straight))
+
+
+def _directions_of_lines(
+    thickness: Float[Array, ""],
+    away: Float[Array, "3 E N"],
+    mine: Float[Array, "3 1 N"],
+    yours: Float[Array, "3 E N"],
+) -> Float[Array, "3 E N"]:
+    """Square to both tangents, or straight away from the partner where that is no direction."""
+    square = away - _dot(mine, away) * mine
+    other = yours - _dot(mine, yours) * mine
+    turned = _dot(other, other)
+    crossing = turned > 0.05
+    part = _dot(other, square) / jnp.where(crossing, turned, 1.0)
+    square = jnp.where(crossing, square - part * other, square)
+    straight = _unit(away, jnp.zeros_like(away).at[2].set(1.0))
+    beside = _dot(square, square) < (0.3 * thickness) ** 2
+    return jnp.where(beside, straight, _unit(square, straight))
+
+
+def _unit(vector: Float[Array, "3 *N"], otherwise: Float[Array, "3 *N"]) -> Float[Array, "3 *N"]:
+    """Of length one; something else where there is no length."""
+    squared = _dot(vector, vector)
+    some = squared > 1e-20
+    return jnp.where(some, vector * jax.lax.rsqrt(jnp.where(some, squared, 1.0)), otherwise)
+
+
+def _dot(a: Float[Array, "3 *N"], b: Float[Array, "3 *N"]) -> Float[Array, "*N"]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
