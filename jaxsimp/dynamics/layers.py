@@ -13,9 +13,9 @@ from jaxsimp.meshes import face_areas
 
 TOP_SPEED = 2.5
 """Default of the fastest that pickers may move, metres per second."""
-INTERVAL = 2
+INTERVAL = 1
 """Default of the time steps from contact to contact."""
-MOST_LAYERS = 2.5
+MOST_LAYERS = 1.25
 """Thicknesses that a picker may move in an interval."""
 
 

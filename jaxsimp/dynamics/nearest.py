@@ -31,6 +31,7 @@ def nearest_above(
     *,
     adjacent: Float[Array, ""],
     squash: Float[Array, ""],
+    level: Float[Array, ""],
     reach: Float[Array, ""],
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
     """The nearest particle on the side that the normal points to, or on both.
@@ -46,6 +47,7 @@ def nearest_above(
         apart: pairs are passed over that are closer than `adjacent` here, metres.
         adjacent: metres.
         squash: see above.
+        level: whatever is no farther below a particle counts as above it, too, metres.
         reach: largest distance that is looked at, metres.
 
     Returns:
@@ -54,7 +56,7 @@ def nearest_above(
     """
     count = position.shape[1]
     order, axis = _sorted_ids(position)
-    rows = _rows(position, normal, one_sided, apart, order, adjacent, squash, reach)
+    rows = _rows(position, normal, one_sided, apart, order, adjacent, squash, level, reach)
     margin = count + PLACES
     ahead = jnp.pad(position[axis, order], (0, margin), constant_values=FAR)
     padded = jnp.pad(rows, ((0, 0), (margin, margin)), constant_values=FAR)
@@ -87,18 +89,21 @@ def _rows(
     order: Int[Array, " N"],
     adjacent: Float[Array, ""],
     squash: Float[Array, ""],
+    level: Float[Array, ""],
     reach: Float[Array, ""],
-) -> Float[Array, "11 N"]:
+) -> Float[Array, "12 N"]:
     """What `_keys` compares, in order, and in units in which no parameter is left.
 
     A scalar in the loop over particles would keep XLA from making vectors of it.
     """
     count = position.shape[1]
+    scale, stretch = jnp.sqrt(_levels(count)) / reach, jnp.sqrt(jnp.maximum(squash, 1e-6))
     rows = [
-        position * (jnp.sqrt(_levels(count)) / reach),
-        normal * jnp.sqrt(jnp.maximum(squash, 1e-6)),
+        position * scale,
+        normal * stretch,
         apart / adjacent,
         jnp.where(one_sided, PASSED_OVER, 0.0)[None],
+        jnp.full((1, count), level * scale * stretch),
     ]
     places = jnp.arange(count, dtype=jnp.float32)[None]
     return jnp.concatenate([jnp.concatenate(rows)[:, order].astype(jnp.float32), places])
@@ -132,8 +137,8 @@ def _keys(here: list[Float[Array, " N"]], other: list[Float[Array, " N"]]) -> Fl
     above = away[0] * here[3] + away[1] * here[4] + away[2] * here[5]
     squared = away[0] * away[0] + away[1] * away[1] + away[2] * away[2] + above * above
     rest = apart[0] * apart[0] + apart[1] * apart[1] + apart[2] * apart[2]
-    key = jnp.floor(squared) * len(here[0]) + other[10]
-    too_close, wrong_side = jnp.maximum(1.0 - rest, 0.0), jnp.maximum(-above, 0.0)
+    key = jnp.floor(squared) * len(here[0]) + other[11]
+    too_close, wrong_side = jnp.maximum(1.0 - rest, 0.0), jnp.maximum(-above - here[10], 0.0)
     return key + PASSED_OVER * too_close + here[9] * wrong_side
 
 

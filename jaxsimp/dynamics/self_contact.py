@@ -29,9 +29,13 @@ UPRIGHT = 0.3
 """Vertical part of its normal from which on a sheet counts as upright."""
 
 
+LEVEL = 0.3
+"""Layers closer than this, of the thickness, count as side by side."""
+
+
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["partner", "direction", "listed", "found_at", "allowance", "missed"],
+    data_fields=["partner", "direction", "listed", "found_at", "allowance", "carried", "missed"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class Contacts:
         listed: whether there is a partner, shape (E, N).
         found_at: positions when they were looked up, shape (3, N), metres.
         allowance: how far each may move from there, shape (N,), metres.
+        carried: 1 for a particle that lies on the table or on one that is carried, shape (N,).
         missed: contacts so far whose particles got past each other within an interval.
     """
 
@@ -52,11 +57,15 @@ class Contacts:
     listed: Bool[Array, "E N"]
     found_at: Float[Array, "3 N"]
     allowance: Float[Array, " N"]
+    carried: Float[Array, " N"]
     missed: Int[Array, ""]
 
 
 def find_contacts(
-    settings: SelfContact, position: Float[Array, "3 N"], missed: Int[Array, ""]
+    settings: SelfContact,
+    position: Float[Array, "3 N"],
+    carried: Float[Array, " N"],
+    missed: Int[Array, ""],
 ) -> Contacts:
     """Look up who may touch whom. Ids count as constants in derivatives, directions do not."""
     still = jax.lax.stop_gradient
@@ -73,6 +82,7 @@ def find_contacts(
             settings.apart,
             adjacent=settings.adjacent,
             squash=settings.squash,
+            level=LEVEL * settings.thickness,
             reach=reach,
         )
 
@@ -80,7 +90,8 @@ def find_contacts(
     partner, distance = (jnp.stack(each) for each in zip(*found, strict=True))
     away = position[:, None] - position[:, partner]
     direct = _directions_of_sheets if settings.is_sheet else _directions_of_lines
-    direction = direct(settings.thickness, away, across[:, None], across[:, partner])
+    mine = jnp.broadcast_to(across[:, None], away.shape)
+    direction = direct(settings.thickness, away, mine, across[:, partner])
     free = (distance.min(axis=0) - touching) / (2.0 * stretch)
     return Contacts(
         partner=partner,
@@ -88,6 +99,7 @@ def find_contacts(
         listed=partner != jnp.arange(position.shape[1])[None],
         found_at=still(position),
         allowance=jnp.maximum(settings.slack, free),
+        carried=carried,
         missed=missed,
     )
 
@@ -105,7 +117,7 @@ def renew(
     far = jnp.sqrt(_dot(moved, moved)) + jnp.sqrt(_dot(coming, coming)) > contacts.allowance
     return jax.lax.cond(
         far.any(),
-        lambda: find_contacts(settings, position, contacts.missed),
+        lambda: find_contacts(settings, position, contacts.carried, contacts.missed),
         lambda: contacts,
     )
 
@@ -131,7 +143,7 @@ def resolve(
         velocity: metres per second.
     """
     partner, along = contacts.partner, contacts.direction
-    rows = jnp.concatenate([position, velocity, inverse_mass[None]])
+    rows = jnp.concatenate([position, velocity, inverse_mass[None], contacts.carried[None]])
     theirs = rows[:, partner]
     away, speed = rows[:3, None] - theirs[:3], rows[3:6, None] - theirs[3:6]
     distance, approach = _dot(along, away), _dot(along, speed)
@@ -140,24 +152,33 @@ def resolve(
     lacking = -jnp.maximum(gap, 0.0) / seconds - approach
     near = contacts.listed & (beside < settings.lateral**2)
     touches = near & ((gap < 0.0) | (lacking > 0.0))
-    shares = touches.sum(axis=0).astype(position.dtype)
-    shares = shares.at[partner].add(touches.astype(position.dtype))
-    mine, yours = (inverse_mass * shares)[None], theirs[6] * shares[partner]
-    both = mine + yours
-    # Zero where both particles are held, or nothing touches.
-    per = jnp.where(touches & (both > 0.0), 1.0 / jnp.where(both > 0.0, both, 1.0), 0.0)
+    # What is carried does not give way to what lies on it: the push would be lost in the table.
+    below, above = along[2] < -0.5, along[2] > 0.5
+    mine = jnp.where(touches, 1.0 - below * rows[7, None], 0.0)
+    yours = jnp.where(touches, 1.0 - above * theirs[7], 0.0)
+    shares = mine.sum(axis=0).at[partner].add(yours)
+    both = mine * (inverse_mass * shares)[None] + yours * theirs[6] * shares[partner]
+    # Zero where neither can move, or nothing touches.
+    per = jnp.where(both > 0.0, 1.0 / jnp.where(both > 0.0, both, 1.0), 0.0)
     impulse = per * jnp.maximum(lacking, 0.0)
-    sliding = speed - approach * along
+    sliding = speed - approach[None] * along
     squared = jnp.maximum(_dot(sliding, sliding), 1e-12)
-    rub = jnp.minimum(per, settings.friction * impulse * jax.lax.rsqrt(squared))
-    push = per * jnp.clip(-gap, 0.0, settings.thickness)
-    change = jnp.concatenate([push * along, impulse * along - rub * sliding])
-    total = change.sum(axis=1).at[:, partner].add(-change)
-    total = inverse_mass * total
+    # Half of what would stop a particle that another carries: both are slowed.
+    rub = jnp.minimum(0.5 * per, settings.friction * impulse * jax.lax.rsqrt(squared))
+    push = (per * jnp.clip(-gap, 0.0, settings.thickness))[None] * along
+    change = impulse[None] * along - rub[None] * sliding
+    total = jnp.concatenate([mine[None] * push, change]).sum(axis=1)
+    total = total.at[:, partner].add(-jnp.concatenate([yours[None] * push, change]))
+    total = inverse_mass[None] * total
     pushed = position + total[:3]
     pushed = pushed.at[2].max(jnp.minimum(position[2], floor))
+    lies = near & (gap < LEVEL * settings.thickness)
+    carried = jnp.where(lies & above, theirs[7], 0.0).max(axis=0, initial=0.0)
+    carried = carried.at[partner].max(jnp.where(lies & below, rows[7, None], 0.0))
+    carried = jnp.maximum(carried, position[2] < floor + 0.1 * settings.thickness)
     missed = contacts.missed + (near & (distance < 0.0)).sum()
-    return replace(contacts, missed=missed), pushed, velocity + total[3:]
+    contacts = replace(contacts, missed=missed, carried=jax.lax.stop_gradient(carried))
+    return contacts, pushed, velocity + total[3:]
 
 
 def _sides(
@@ -172,7 +193,7 @@ def _sides(
     count = across.shape[1]
     if settings.is_sheet:
         tilt = across[2]
-        return [(jnp.where(tilt < 0.0, -across, across), jnp.abs(tilt) > UPRIGHT)]
+        return [(jnp.where(tilt[None] < 0.0, -across, across), jnp.abs(tilt) > UPRIGHT)]
     upwards = jnp.zeros_like(across).at[2].set(1.0)
     return [(upwards, jnp.ones(count, bool)), (-upwards, jnp.ones(count, bool))]
 
@@ -187,7 +208,7 @@ def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array
 def _directions_of_sheets(
     thickness: Float[Array, ""],
     away: Float[Array, "3 E N"],
-    mine: Float[Array, "3 1 N"],
+    mine: Float[Array, "3 E N"],
     yours: Float[Array, "3 E N"],
 ) -> Float[Array, "3 E N"]:
     """Along both normals, each turned to point away from the partner.
@@ -195,36 +216,37 @@ def _directions_of_sheets(
     Where the partner is beside the particle and not above or below it, straight away from it.
     """
     above, below = _dot(mine, away), _dot(yours, away)
-    bisector = jnp.where(above < 0, -mine, mine) + jnp.where(below < 0, -yours, yours)
+    bisector = jnp.where(above[None] < 0, -mine, mine) + jnp.where(below[None] < 0, -yours, yours)
     straight = _unit(away, jnp.zeros_like(away).at[2].set(1.0))
-    beside = jnp.maximum(jnp.abs(above), jnp.abs(below)) < 0.3 * thickness
+    beside = jnp.maximum(jnp.abs(above), jnp.abs(below)) < LEVEL * thickness
     folded = _dot(bisector, bisector) < 1.0
-    return jnp.where(beside | folded, straight, _unit(bisector, straight))
+    return jnp.where((beside | folded)[None], straight, _unit(bisector, straight))
 
 
 def _directions_of_lines(
     thickness: Float[Array, ""],
     away: Float[Array, "3 E N"],
-    mine: Float[Array, "3 1 N"],
+    mine: Float[Array, "3 E N"],
     yours: Float[Array, "3 E N"],
 ) -> Float[Array, "3 E N"]:
     """Square to both tangents, or straight away from the partner where that is no direction."""
-    square = away - _dot(mine, away) * mine
-    other = yours - _dot(mine, yours) * mine
+    square = away - _dot(mine, away)[None] * mine
+    other = yours - _dot(mine, yours)[None] * mine
     turned = _dot(other, other)
     crossing = turned > 0.05
     part = _dot(other, square) / jnp.where(crossing, turned, 1.0)
-    square = jnp.where(crossing, square - part * other, square)
+    square = jnp.where(crossing[None], square - part[None] * other, square)
     straight = _unit(away, jnp.zeros_like(away).at[2].set(1.0))
-    beside = _dot(square, square) < (0.3 * thickness) ** 2
-    return jnp.where(beside, straight, _unit(square, straight))
+    beside = _dot(square, square) < (LEVEL * thickness) ** 2
+    return jnp.where(beside[None], straight, _unit(square, straight))
 
 
 def _unit(vector: Float[Array, "3 *N"], otherwise: Float[Array, "3 *N"]) -> Float[Array, "3 *N"]:
     """Of length one; something else where there is no length."""
     squared = _dot(vector, vector)
     some = squared > 1e-20
-    return jnp.where(some, vector * jax.lax.rsqrt(jnp.where(some, squared, 1.0)), otherwise)
+    scale = jax.lax.rsqrt(jnp.where(some, squared, 1.0))
+    return jnp.where(some[None], vector * scale[None], otherwise)
 
 
 def _dot(a: Float[Array, "3 *N"], b: Float[Array, "3 *N"]) -> Float[Array, "*N"]:

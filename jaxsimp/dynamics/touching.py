@@ -22,7 +22,9 @@ def begin(simulation: Simulation, state: State) -> Moving:
     settings, contacts = simulation.self_contact, None
     if settings is not None:
         missed = jnp.zeros((), dtype=int) if state.missed is None else state.missed
-        contacts = find_contacts(settings, state.position.T, missed)
+        contacts = find_contacts(
+            settings, state.position.T, jnp.zeros_like(simulation.mass), missed
+        )
     return pack(simulation, state), contacts
 
 

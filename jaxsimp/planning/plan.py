@@ -57,10 +57,12 @@ class Execution:
     Attributes:
         positions: at the start, after each action, and settled, shape (T + 2, N, 3), metres.
         score: normalised score of the settled state.
+        missed: contacts whose particles got past each other; None without self-contact.
     """
 
     positions: Float[np.ndarray, "T2 N 3"]
     score: float
+    missed: int | None = None
 
 
 class Planner:
@@ -73,22 +75,38 @@ class Planner:
         compile_seconds: that compiling the rollouts took.
     """
 
-    def __init__(self, task: Task, config: CEMConfig, layout: Layout | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        config: CEMConfig,
+        layout: Layout | None = None,
+        *,
+        plan_contact: bool = False,
+        execute_contact: bool = True,
+    ) -> None:
         """Compile the task's rollouts for the population of `config`.
 
         Args:
             task: what is planned for.
             config: settings of the search.
             layout: of the population on this machine; by default the one measured to be best.
+            plan_contact: whether the body touches itself while plans are searched for.
+            execute_contact: whether it does while a plan is carried out.
+
+        Raises:
+            ValueError: if self-contact is asked for and refused, see `Task.simulation`.
         """
         self.task, self.config = task, config
-        simulation = task.simulation()
+        simulation = task.simulation(self_contact=plan_contact)
         self._physics = simulation, _pickers(task)
-        shared = (self._physics, self._episode(task.episode_fn(0)))
+        self._executed = task.simulation(self_contact=execute_contact), _pickers(task)
+        episode = self._episode(task.episode_fn(0))
+        shared = (self._physics, episode)
         self.layout = layout or default_layout(config.population, simulation)
         one = jax.tree.map(lambda array: array[:1], self._idle())
         self._costs = PopulationMap(partial(_plan_cost, task), shared, self._idle(), self.layout)
-        self._execution = PopulationMap(partial(_execute, task), shared, one, Layout())
+        executed = (self._executed, episode)
+        self._execution = PopulationMap(partial(_execute, task), executed, one, Layout())
         self.compile_seconds = self._costs.compile_seconds + self._execution.compile_seconds
 
     def plan(
@@ -138,10 +156,10 @@ class Planner:
 
     def execute(self, episode: Episode, actions: Actions) -> Execution:
         """Carry out a plan, let the body settle, and score it."""
-        shared = (self._physics, self._episode(episode))
+        shared = (self._executed, self._episode(episode))
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
-        (positions,), (value,) = self._execution(shared, one)
-        return Execution(positions, float(value))
+        (positions,), (value,), missed = self._execution(shared, one)
+        return Execution(positions, float(value), None if missed is None else int(missed[0]))
 
     def _idle(self) -> Actions:
         """A population of plans that grasp nothing."""
@@ -179,15 +197,15 @@ def _plan_cost(
 
 def _execute(
     task: Task, shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
-) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""]]:
-    """Positions at the start, after each action and settled, and the score of the last."""
+) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""], Int[Array, ""] | None]:
+    """Positions at the start, after each action and settled, score of the last, and `missed`."""
     (simulation, pickers), episode = shared
     start = at_rest(episode.start)
     followed = _then_idle(actions, task.settle_actions)
     final, positions = rollout(simulation, pickers, start, followed)
     during = positions[: task.num_actions]
     positions = jnp.concatenate([start.position[None], during, final.position[None]])
-    return positions, score(task, episode, final.position)
+    return positions, score(task, episode, final.position), final.missed
 
 
 def _then_idle(actions: Actions, count: int) -> Actions:
