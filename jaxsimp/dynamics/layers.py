@@ -11,12 +11,16 @@ from jaxtyping import Array, Float, Int
 from jaxsimp.body import Body
 from jaxsimp.meshes import face_areas
 
-TOP_SPEED = 2.5
+TOP_SPEED = 2.1
 """Default of the fastest that pickers may move, metres per second."""
+SPARE = 1.05
+"""Times the thickness that layers are held apart: what presses them pushes them in a little."""
 INTERVAL = 1
 """Default of the time steps from contact to contact."""
-MOST_LAYERS = 1.25
+MOST_LAYERS_OF_SHEETS = 1.1
 """Thicknesses that a picker may move in an interval."""
+MOST_LAYERS_OF_ROPES = 0.75
+"""The same for ropes: struck faster, they are stretched until the gaps in them let others through."""
 
 
 @partial(
@@ -34,7 +38,7 @@ class SelfContact:
             `(x_a - x_b) x (x_c - x_d)`, its rope's tangent along `x_a - x_b`, shape (4, N).
         apart: rest coordinates, unconnected parts moved away from each other, shape (3, N), metres.
         adjacent: pairs closer than that at rest do not collide, metres.
-        thickness: distance of two layers that touch, metres.
+        thickness: distance that layers are held apart, `SPARE` times the body's, metres.
         lateral: particles touch that are not farther apart along their layers, metres.
         margin: how far pickers move in an interval, metres.
         slack: how far one that touches may move until contacts are looked up again, metres.
@@ -87,7 +91,9 @@ def make_self_contact(
     if not 0 <= friction < np.inf:
         raise ValueError(f"friction is {friction}; give a finite number, zero or more")
     seconds = interval * time_step
-    fastest = MOST_LAYERS * thickness / seconds
+    is_sheet = len(body.faces) > 0
+    layers = MOST_LAYERS_OF_SHEETS if is_sheet else MOST_LAYERS_OF_ROPES
+    fastest = layers * thickness / seconds
     if not 0 < top_speed <= fastest:
         raise ValueError(
             f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "
@@ -95,7 +101,6 @@ def make_self_contact(
             f"every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a smaller time "
             f"step or interval, or a larger radius"
         )
-    is_sheet = len(body.faces) > 0
     covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.
     stretch = max(1.0, covering**2 / (3 * thickness**2)) if is_sheet else 1.0
@@ -107,10 +112,10 @@ def make_self_contact(
         frame=jnp.asarray(_frames(body), dtype=int),
         apart=array(_apart(body).T),
         adjacent=array(max(1.25 * body.rest_length.max(), 2 * thickness)),
-        thickness=array(thickness),
+        thickness=array(SPARE * thickness),
         lateral=array(1.2 * covering),
         margin=array(top_speed * seconds),
-        slack=array(0.4 * covering),
+        slack=array(0.25 * covering),
         squash=array(stretch - 1),
         friction=array(friction),
         is_sheet=is_sheet,

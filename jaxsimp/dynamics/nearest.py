@@ -11,7 +11,7 @@ of float32, and not, in loops as long as these, of selections and of bits of int
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 PLACES = 8
 """Places of the sorted order that are compared at a time."""
@@ -26,7 +26,6 @@ EXACT = 1 << 24
 def nearest_above(
     position: Float[Array, "3 N"],
     normal: Float[Array, "3 N"],
-    one_sided: Bool[Array, " N"],
     apart: Float[Array, "3 N"],
     *,
     adjacent: Float[Array, ""],
@@ -34,7 +33,7 @@ def nearest_above(
     level: Float[Array, ""],
     reach: Float[Array, ""],
 ) -> tuple[Int[Array, " N"], Float[Array, " N"]]:
-    """The nearest particle on the side that the normal points to, or on both.
+    """The nearest particle on the side that the normal points to.
 
     Distances are `sqrt(r^2 + squash (n.r)^2)`: with a squash above 0 what is beside a particle is
     nearer than what is as far above it. Their squares are told apart to `N / 2^24` of that of the
@@ -43,7 +42,6 @@ def nearest_above(
     Args:
         position: metres.
         normal: of unit length.
-        one_sided: whether only the normal's side is looked at.
         apart: pairs are passed over that are closer than `adjacent` here, metres.
         adjacent: metres.
         squash: see above.
@@ -56,7 +54,7 @@ def nearest_above(
     """
     count = position.shape[1]
     order, axis = _sorted_ids(position)
-    rows = _rows(position, normal, one_sided, apart, order, adjacent, squash, level, reach)
+    rows = _rows(position, normal, apart, order, adjacent, squash, level, reach)
     margin = count + PLACES
     ahead = jnp.pad(position[axis, order], (0, margin), constant_values=FAR)
     padded = jnp.pad(rows, ((0, 0), (margin, margin)), constant_values=FAR)
@@ -84,14 +82,13 @@ def nearest_above(
 def _rows(
     position: Float[Array, "3 N"],
     normal: Float[Array, "3 N"],
-    one_sided: Bool[Array, " N"],
     apart: Float[Array, "3 N"],
     order: Int[Array, " N"],
     adjacent: Float[Array, ""],
     squash: Float[Array, ""],
     level: Float[Array, ""],
     reach: Float[Array, ""],
-) -> Float[Array, "12 N"]:
+) -> Float[Array, "11 N"]:
     """What `_keys` compares, in order, and in units in which no parameter is left.
 
     A scalar in the loop over particles would keep XLA from making vectors of it.
@@ -102,7 +99,6 @@ def _rows(
         position * scale,
         normal * stretch,
         apart / adjacent,
-        jnp.where(one_sided, PASSED_OVER, 0.0)[None],
         jnp.full((1, count), level * scale * stretch),
     ]
     places = jnp.arange(count, dtype=jnp.float32)[None]
@@ -137,9 +133,9 @@ def _keys(here: list[Float[Array, " N"]], other: list[Float[Array, " N"]]) -> Fl
     above = away[0] * here[3] + away[1] * here[4] + away[2] * here[5]
     squared = away[0] * away[0] + away[1] * away[1] + away[2] * away[2] + above * above
     rest = apart[0] * apart[0] + apart[1] * apart[1] + apart[2] * apart[2]
-    key = jnp.floor(squared) * len(here[0]) + other[11]
-    too_close, wrong_side = jnp.maximum(1.0 - rest, 0.0), jnp.maximum(-above - here[10], 0.0)
-    return key + PASSED_OVER * too_close + here[9] * wrong_side
+    key = jnp.floor(squared) * len(here[0]) + other[10]
+    too_close, wrong_side = jnp.maximum(1.0 - rest, 0.0), jnp.maximum(-above - here[9], 0.0)
+    return key + PASSED_OVER * (too_close + wrong_side)
 
 
 def _decoded(

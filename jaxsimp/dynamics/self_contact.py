@@ -3,8 +3,8 @@
 A particle of a sheet stands for a disc in the sheet's plane, one of a rope for a piece of its
 line. Each touches at most one other on either side: the nearest that is not its neighbour in the
 body (see nearest.py). A contact keeps the direction that it was found with, from one particle to
-the other and square to both sheets or lines, until all are looked up again. That is when a
-particle may move farther than its distance from what it does not touch allows.
+the other and square to both sheets or lines, until all are looked up again. That is when one has
+moved farther than its distance from what it does not touch allows.
 
 Contact acts every `interval` time steps on velocities, as impulses that are inelastic and look
 ahead (nobody approaches faster than would close the gap within the interval), with Coulomb
@@ -25,8 +25,6 @@ from jaxsimp.dynamics.layers import SelfContact
 from jaxsimp.dynamics.nearest import nearest_above
 
 
-UPRIGHT = 0.3
-"""Vertical part of its normal from which on a sheet counts as upright."""
 
 
 LEVEL = 0.3
@@ -43,18 +41,18 @@ class Contacts:
     """Who may touch whom.
 
     Attributes:
-        partner: particle ids, for each side looked at, shape (E, N).
-        direction: of unit length, from the partner, shape (3, E, N).
-        listed: whether there is a partner, shape (E, N).
+        partner: particle ids, one on either side, shape (2, N).
+        direction: of unit length, from the partner, shape (3, 2, N).
+        listed: whether there is a partner, shape (2, N).
         found_at: positions when they were looked up, shape (3, N), metres.
         allowance: how far each may move from there, shape (N,), metres.
         carried: 1 for a particle that lies on the table or on one that is carried, shape (N,).
         missed: contacts so far whose particles got past each other within an interval.
     """
 
-    partner: Int[Array, "E N"]
-    direction: Float[Array, "3 E N"]
-    listed: Bool[Array, "E N"]
+    partner: Int[Array, "2 N"]
+    direction: Float[Array, "3 2 N"]
+    listed: Bool[Array, "2 N"]
     found_at: Float[Array, "3 N"]
     allowance: Float[Array, " N"]
     carried: Float[Array, " N"]
@@ -74,11 +72,14 @@ def find_contacts(
     touching = jnp.hypot(settings.lateral, stretch * settings.thickness)
     reach = jnp.hypot(settings.lateral, stretch * (settings.thickness + settings.margin))
 
-    def look(normal: Float[Array, "3 N"], one_sided: Bool[Array, " N"]) -> tuple[Array, Array]:
+    # The sides of a sheet; around a rope there is room for more: it is above and below.
+    upwards = jnp.zeros_like(position).at[2].set(1.0)
+    normal = still(across) if settings.is_sheet else upwards
+
+    def look(normal: Float[Array, "3 N"]) -> tuple[Array, Array]:
         return nearest_above(
             still(position),
             normal,
-            one_sided,
             settings.apart,
             adjacent=settings.adjacent,
             squash=settings.squash,
@@ -86,7 +87,7 @@ def find_contacts(
             reach=reach,
         )
 
-    found = [look(*side) for side in _sides(settings, still(across))]
+    found = look(normal), look(-normal)
     partner, distance = (jnp.stack(each) for each in zip(*found, strict=True))
     away = position[:, None] - position[:, partner]
     direct = _directions_of_sheets if settings.is_sheet else _directions_of_lines
@@ -108,15 +109,11 @@ def renew(
     settings: SelfContact,
     contacts: Contacts,
     position: Float[Array, "3 N"],
-    velocity: Float[Array, "3 N"],
-    seconds: Float[Array, ""],
 ) -> Contacts:
-    """The contacts, looked up again if a particle may go too far in the time to come."""
-    moved = jax.lax.stop_gradient(position) - contacts.found_at
-    coming = seconds * jax.lax.stop_gradient(velocity)
-    far = jnp.sqrt(_dot(moved, moved)) + jnp.sqrt(_dot(coming, coming)) > contacts.allowance
+    """The contacts, looked up again if a particle has gone too far."""
+    moved = jax.lax.stop_gradient(position - contacts.found_at)
     return jax.lax.cond(
-        far.any(),
+        (_dot(moved, moved) > contacts.allowance**2).any(),
         lambda: find_contacts(settings, position, contacts.carried, contacts.missed),
         lambda: contacts,
     )
@@ -181,23 +178,6 @@ def resolve(
     return contacts, pushed, velocity + total[3:]
 
 
-def _sides(
-    settings: SelfContact, across: Float[Array, "3 N"]
-) -> list[tuple[Float[Array, "3 N"], Bool[Array, " N"]]]:
-    """The sides that partners are looked for on: normals, and whether only there.
-
-    In a sheet it is the upper side: so layers that lie on each other are found from the lower
-    one. Where a sheet is nearly upright it is either side. Around a rope there is room for more:
-    it is above and below.
-    """
-    count = across.shape[1]
-    if settings.is_sheet:
-        tilt = across[2]
-        return [(jnp.where(tilt[None] < 0.0, -across, across), jnp.abs(tilt) > UPRIGHT)]
-    upwards = jnp.zeros_like(across).at[2].set(1.0)
-    return [(upwards, jnp.ones(count, bool)), (-upwards, jnp.ones(count, bool))]
-
-
 def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
     """Unit normals of a sheet, or tangents of a rope."""
     a, b, c, d = (position[:, ids] for ids in settings.frame)
@@ -207,10 +187,10 @@ def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array
 
 def _directions_of_sheets(
     thickness: Float[Array, ""],
-    away: Float[Array, "3 E N"],
-    mine: Float[Array, "3 E N"],
-    yours: Float[Array, "3 E N"],
-) -> Float[Array, "3 E N"]:
+    away: Float[Array, "3 2 N"],
+    mine: Float[Array, "3 2 N"],
+    yours: Float[Array, "3 2 N"],
+) -> Float[Array, "3 2 N"]:
     """Along both normals, each turned to point away from the partner.
 
     Where the partner is beside the particle and not above or below it, straight away from it.
@@ -225,10 +205,10 @@ def _directions_of_sheets(
 
 def _directions_of_lines(
     thickness: Float[Array, ""],
-    away: Float[Array, "3 E N"],
-    mine: Float[Array, "3 E N"],
-    yours: Float[Array, "3 E N"],
-) -> Float[Array, "3 E N"]:
+    away: Float[Array, "3 2 N"],
+    mine: Float[Array, "3 2 N"],
+    yours: Float[Array, "3 2 N"],
+) -> Float[Array, "3 2 N"]:
     """Square to both tangents, or straight away from the partner where that is no direction."""
     square = away - _dot(mine, away)[None] * mine
     other = yours - _dot(mine, yours)[None] * mine

@@ -71,6 +71,6 @@ def _touch(
     contacts, position, velocity = resolve(
         settings, contacts, inverse_mass, simulation.radius, seconds, position, velocity
     )
-    contacts = renew(settings, contacts, position, velocity, seconds)
+    contacts = renew(settings, contacts, position)
     padding = ((0, 0), (halo, halo))
     return (jnp.pad(position, padding), jnp.pad(velocity, padding)), contacts
