@@ -25,8 +25,17 @@ MOST_LAYERS_OF_ROPES = 0.75
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["frame", "apart", "adjacent", "thickness", "lateral", "margin", "slack",
-                 "squash", "friction"],
+    data_fields=[
+        "frame",
+        "apart",
+        "adjacent",
+        "thickness",
+        "lateral",
+        "margin",
+        "slack",
+        "squash",
+        "friction",
+    ],
     meta_fields=["is_sheet", "interval"],
 )
 @dataclass(frozen=True)
@@ -169,7 +178,9 @@ def _frames(body: Body) -> np.ndarray:
 def _neighbours(body: Body) -> list[np.ndarray]:
     """Next neighbours of each particle: along edges of triangles, or the shorter springs."""
     if len(body.faces):
-        pairs = np.concatenate([body.faces[:, [0, 1]], body.faces[:, [1, 2]], body.faces[:, [2, 0]]])
+        pairs = np.concatenate(
+            [body.faces[:, [0, 1]], body.faces[:, [1, 2]], body.faces[:, [2, 0]]]
+        )
     else:
         pairs = body.springs[body.rest_length < 1.5 * _spacing(body)]
     pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)

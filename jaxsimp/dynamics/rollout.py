@@ -42,7 +42,6 @@ def rollout(
         The state at the end of the last action, and the observations stacked along a first
         axis of length T; by default the positions, shape (T, N, 3).
     """
-
     advance = steps if adjoint else plain_steps
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:

@@ -24,9 +24,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsimp.dynamics.layers import SelfContact
 from jaxsimp.dynamics.nearest import nearest_above
 
-
-
-
 LEVEL = 0.3
 """Layers closer than this, of the thickness, count as side by side."""
 

@@ -82,7 +82,7 @@ class Planner:
         layout: Layout | None = None,
         *,
         plan_contact: bool = False,
-        execute_contact: bool = True,
+        execute_contact: bool = False,
     ) -> None:
         """Compile the task's rollouts for the population of `config`.
 

@@ -22,7 +22,7 @@ from jaxsimp.dynamics import (
     rollout,
     settle,
 )
-from jaxsimp.dynamics.layers import MOST_LAYERS_OF_ROPES, make_self_contact
+from jaxsimp.dynamics.layers import MOST_LAYERS_OF_ROPES, SPARE, make_self_contact
 from jaxsimp.dynamics.nearest import nearest_above
 from jaxsimp.dynamics.self_contact import find_contacts, resolve
 from jaxsimp.planning import default_layout
@@ -67,7 +67,6 @@ def test_nearest_is_that_of_all_pairs(count):
     adjacent, squash, level, reach = 0.05, 1.5, 0.002, 0.06
     ids, distance = nearest_above(
         *(jnp.asarray(each, jnp.float32) for each in (position, normal)),
-        jnp.full(count),
         jnp.asarray(apart, jnp.float32),
         adjacent=jnp.float32(adjacent),
         squash=jnp.float32(squash),
@@ -115,7 +114,7 @@ def pair(gap: float, speed: float, *, sideways: float = 0.0, masses=(1.0, 3.0), 
     body = two_pieces(one, one)
     settings = make_self_contact(body, 1e-3, top_speed=2.0)
     position = np.concatenate([one.rest, one.rest[:, [1, 0, 2]]]) + [0, 0, 1.0]
-    position[:3, 2] += 2 * body.radius + gap
+    position[:3, 2] += float(settings.thickness) + gap
     velocity = np.zeros((6, 3))
     velocity[:3] = [sideways, 0, -speed]
     inverse = 1 / np.repeat(masses, 3)
@@ -141,7 +140,7 @@ def test_particles_that_meet_head_on_go_on_together():
     # Perfectly inelastic: (1 * -1 + 3 * 0) / 4; the ends of the ropes do not touch.
     np.testing.assert_allclose(after[2, [1, 4]], -0.25, rtol=1e-12)
     np.testing.assert_allclose(after[2, [0, 2, 3, 5]], [-1, -1, 0, 0], atol=1e-12)
-    assert np.all(moved == 0)
+    assert np.abs(moved).max() < 1e-12
     np.testing.assert_allclose(after @ mass, [0, 0, -3], atol=1e-12)
 
 
@@ -198,7 +197,7 @@ def test_layers_rest_on_each_other():
     final = settle(simulation, at_rest(position), 600)
     heights = [float(final.position[layer == each, 2].mean()) for each in range(4)]
     # What lies on a layer presses it in by what it falls in a step or two, 0.02 mm each.
-    np.testing.assert_allclose(heights, 0.002 + 0.004 * np.arange(4), atol=2e-4)
+    np.testing.assert_allclose(heights, 0.002 + SPARE * 0.004 * np.arange(4), atol=1e-4)
     assert colliding_distances(simulation, final.position).min() > 0.8 * 0.004
 
 
