@@ -13,7 +13,17 @@ import jax
 import jax.numpy as jnp
 
 CONFIG_FILE = "config.json"
-PACKAGES = ("jaxsimp", "jax", "jaxlib", "numpy", "scipy", "optax", "libigl", "proxsuite")
+PACKAGES = (
+    "jaxsimp",
+    "jax",
+    "jaxlib",
+    "numpy",
+    "scipy",
+    "optax",
+    "libigl",
+    "proxsuite",
+    "mujoco",
+)
 
 
 class ResultsError(Exception):

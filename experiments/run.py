@@ -11,7 +11,7 @@ from typing import ClassVar, Literal
 import tyro
 from rich.console import Console
 
-from experiments import records, simplification
+from experiments import records, simplification, transfer
 from experiments.plans import ACTION_SPACES, Study, run_study
 from experiments.simplification import available_methods
 from jaxsimp.planning import ENCODINGS
@@ -186,9 +186,55 @@ class SimplificationOptions:
         console.print(f"done: {folder}/report.md")
 
 
+@dataclass(frozen=True)
+class TransferOptions(PlanOptions):
+    """Plans found in our dynamics, carried out in MuJoCo, with self-collision and without.
+
+    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    """
+
+    NAME: ClassVar[str] = "transfer"
+    TRANSFER_SCORE: ClassVar[float] = 0.8
+
+    tasks: tuple[str, ...] = task_names("paper")
+    """Tasks to plan for."""
+    action_spaces: tuple[str, ...] = ("key_points",)
+    """Particles that may be grasped."""
+    pick_encodings: tuple[str, ...] = ("categorical",)
+    """How CEM encodes what is grasped."""
+    plans: Path | None = None
+    """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
+
+    def transfer(self) -> transfer.Study:
+        """The study that these options ask for.
+
+        Raises:
+            ValueError: if an option has a value that it cannot have.
+        """
+        planned = transfer.planned_study(self.plans) if self.plans else self.configuration()
+        source = str(self.plans) if self.plans else None
+        return transfer.Study(planned, source, self.TRANSFER_SCORE)
+
+    def run(self, console: Console) -> None:
+        """Run the study, or list what it can be asked for."""
+        if self.list:
+            _list(console)
+            return
+        study, folder = self.transfer(), results_folder(self)
+        records.open_folder(folder, study.identity())
+        from experiments.transfer_report import write_report
+
+        start = time.perf_counter()
+        summary = transfer.run_study(study, folder, console)
+        write_report(study, summary, folder)
+        minutes = (time.perf_counter() - start) / 60
+        console.print(f"done in {minutes:.1f} minutes: {folder}/report.md")
+
+
 Options = PlanOptions | SimplificationOptions
 STUDIES: dict[str, type[Options]] = {
-    options.NAME: options for options in (PaperOptions, GoalsOptions, SimplificationOptions)
+    options.NAME: options
+    for options in (PaperOptions, GoalsOptions, SimplificationOptions, TransferOptions)
 }
 """Options of the studies by name; the first one is run where none is named."""
 

@@ -90,6 +90,36 @@ def plot_costs(
     return figure
 
 
+def plot_scores(
+    scores: Mapping[str, Mapping[str, Float[np.ndarray, "R 2"]]],
+    xlabel: str,
+    ylabel: str,
+    success: float,
+) -> "Figure":
+    """Scores of the same plans in two engines, a panel a task.
+
+    Args:
+        scores: for each task, for each method, a row a plan: its two scores; those that are not
+            finite are left out.
+        xlabel: what the first score is.
+        ylabel: what the second score is.
+        success: score of a plan that succeeds, a dashed line.
+    """
+    figure, panels = _panels(scores)
+    for axes, (name, methods) in zip(panels, scores.items(), strict=True):
+        shown = np.concatenate([np.array([[success, success]]), *methods.values()])
+        low = min(0.0, float(np.nanmin(shown))) - 0.05
+        axes.plot([low, 1.05], [low, 1.05], color=GOAL_COLOR, lw=0.8)
+        axes.axhline(success, color=GOAL_COLOR, ls="--", lw=0.8)
+        for index, (method, pairs) in enumerate(methods.items()):
+            color, marker = COLORS[index % len(COLORS)], "os^D"[index % 4]
+            axes.plot(*pairs.T, marker, color=color, ms=5, alpha=0.7, mew=0, label=method)
+        axes.set(xlim=(low, 1.05), ylim=(low, 1.05), xlabel=xlabel, ylabel=ylabel)
+        axes.set_title(_title(name))
+    panels[0].legend(frameon=False, fontsize="small", loc="upper left")
+    return figure
+
+
 def mean_interval(
     runs: Float[np.ndarray, "R I"],
 ) -> tuple[Float[np.ndarray, " I"], Float[np.ndarray, " I"]]:

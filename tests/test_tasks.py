@@ -260,6 +260,18 @@ def test_gradient_of_the_matching_distance_is_that_of_the_best_assignment(x64):
 
 
 @pytest.mark.parametrize("name", task_names())
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_positions_that_are_not_finite_have_no_finite_cost(name, bad):
+    # Planning counts on it: such a rollout ranks last. Particle 0 matters to every cost.
+    task = make_task(name, quick=True)
+    episode = task.episode_fn(0)
+    one = np.array(episode.start)
+    one[0, 1] = bad
+    for position in (one, np.full_like(one, bad)):
+        assert not np.isfinite(cost_of(task, episode, position))
+
+
+@pytest.mark.parametrize("name", task_names())
 def test_gradients_are_finite_at_the_start_at_the_goal_and_where_points_coincide(name):
     task = make_task(name, quick=True)
     episode = task.episode_fn(0)

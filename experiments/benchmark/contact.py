@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +84,7 @@ def _fold(side: int, touches: bool) -> partial[object]:
     actions = Actions(jnp.asarray(picks), jnp.asarray(moves, dtype=float))
     start = jnp.asarray(goals.flat(body), dtype=float)
 
-    def final(shared: tuple[object, ...], actions: Actions) -> jax.Array:
+    def final(shared: Any, actions: Actions) -> jax.Array:
         simulation, pickers, start = shared
         return rollout(simulation, pickers, at_rest(start), actions)[0].position
 

@@ -51,6 +51,7 @@ class Scale:
         cem_iterations: of a plan.
         cem_plans: plans made.
         cold_starts: processes started of each kind.
+        caches: compilation caches that they start with: none, an empty one, the one it filled.
         goals: numbers of goals that lines are fitted to.
     """
 
@@ -69,6 +70,7 @@ class Scale:
     cem_iterations: int
     cem_plans: int
     cold_starts: int
+    caches: tuple[str, ...]
     goals: tuple[int, ...]
 
 
@@ -88,6 +90,7 @@ FULL = Scale(
     cem_iterations=15,
     cem_plans=3,
     cold_starts=3,
+    caches=("no cache", "empty cache", "filled cache"),
     goals=(1, 64, 1024),
 )
 QUICK = Scale(
@@ -97,15 +100,16 @@ QUICK = Scale(
     population=32,
     num_actions=2,
     action_steps=50,
-    chunk_sizes=(1, 8),
-    growth=(1, 4),
-    sides=(16, 25, 50),
+    chunk_sizes=(8,),
+    growth=(1,),
+    sides=(25, 50),
     populations=(16, 64),
     horizons=(2, 16),
     cem_side=15,
     cem_iterations=4,
     cem_plans=1,
     cold_starts=1,
+    caches=("empty cache", "filled cache"),
     goals=(1, 64),
 )
 

@@ -137,7 +137,6 @@ def _curves(rest: np.ndarray, count: int) -> np.ndarray:
     return goals.astype(np.float32)
 
 
-CACHES = ("no cache", "empty cache", "filled cache")
 COLD_START = """
 import json, sys, time
 start = time.perf_counter()
@@ -162,7 +161,8 @@ def cold_start(scale: Scale) -> Iterator[Row]:
     found: dict[str, list[dict[str, float]]] = {}
     for _ in range(scale.cold_starts):
         with tempfile.TemporaryDirectory() as folder:
-            for cache, path in zip(CACHES, (None, folder, folder), strict=True):
+            for cache in scale.caches:
+                path = None if cache == "no cache" else folder
                 found.setdefault(cache, []).append(_start_cold(scale, path))
     fields = {"engine": "jaxsimp", "body": f"cloth_{scale.cem_side}"}
     every = [times for all_times in found.values() for times in all_times]

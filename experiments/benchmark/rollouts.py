@@ -184,9 +184,9 @@ def gradient(scale: Scale) -> Iterator[Row]:
     rows: list[tuple[Row, Row]] = []
     for factor in scale.growth:
         workload = _cloth(scale, population=1, steps=factor * scale.action_steps)
-        ready = [
-            prepare(partial(_map_costs, function, workload)) for function in functions.values()
-        ]
+        maps = [_map_costs(function, workload) for function in functions.values()]
+        arguments = physics(workload), plans(workload)
+        ready = [prepare(partial(partial, mapped, *arguments)) for mapped in maps]
         times = time_in_turns([each.run for each in ready], scale.repeats)
         ratios = (None, float(np.median(times[:, 1] / times[:, 0])))
         forward, backward = (
@@ -198,28 +198,30 @@ def gradient(scale: Scale) -> Iterator[Row]:
                 layout=name,
                 steps=factor * scale.action_steps * scale.num_actions,
                 ratio_to_forward=ratio,
+                temporary_megabytes=mapped.temporary_bytes / 1e6,
                 memory_exponent=None,
             )
             | measured(each, seconds, workload.particle_steps)
-            for name, each, seconds, ratio in zip(functions, ready, times.T, ratios, strict=True)
+            | {"compile_seconds": mapped.compile_seconds}
+            for name, mapped, each, seconds, ratio in zip(
+                functions, maps, ready, times.T, ratios, strict=True
+            )
         )
         rows.append((forward, backward))
-    gradients = [backward for _, backward in rows]
-    exponent = _exponent(gradients, "steps", "peak_megabytes")
+    # Of what the compiler sets aside: it is exact, where the peak of a process is not.
+    exponent = _exponent([backward for _, backward in rows], "steps", "temporary_megabytes")
     for forward, backward in rows:
         yield forward
         yield backward | {"memory_exponent": exponent}
 
 
-def _map_costs(function: Callable[..., Any], workload: Workload) -> Callable[[], Any]:
+def _map_costs(function: Callable[..., Any], workload: Workload) -> PopulationMap:
     """A function of the moves of every rollout, compiled as populations are."""
-    shared, actions = physics(workload), plans(workload)
 
     def one(shared: Physics, actions: Actions) -> Any:
         return function(actions.displacement, shared, actions.pick)
 
-    mapped = PopulationMap(one, shared, actions, Layout())
-    return lambda: mapped(shared, actions)
+    return PopulationMap(one, physics(workload), plans(workload), Layout())
 
 
 def _squared_distance(

@@ -20,7 +20,7 @@ INTERVAL = 1
 MOST_LAYERS_OF_SHEETS = 1.1
 """Thicknesses that a picker may move in an interval."""
 MOST_LAYERS_OF_ROPES = 0.75
-"""The same for ropes: struck faster, they are stretched until the gaps in them let others through."""
+"""The same for ropes: struck faster, they stretch until their gaps let others through."""
 
 
 @partial(
@@ -106,9 +106,9 @@ def make_self_contact(
     if not 0 < top_speed <= fastest:
         raise ValueError(
             f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "
-            f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s when contact acts "
-            f"every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a smaller time "
-            f"step or interval, or a larger radius"
+            f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s when contact "
+            f"acts every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a "
+            f"smaller time step or interval, or a larger radius"
         )
     covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.

@@ -45,7 +45,7 @@ def touching_steps(
     shares: Float[Array, " S"],
 ) -> Moving:
     """Time steps; with self-contact, in runs of `interval` or fewer with contact after each."""
-    packed, contacts = moving
+    packed, _ = moving
     settings, plain = simulation.self_contact, replace(simulation, self_contact=None)
     if settings is None:
         return advance(simulation, packed, motion, shares), None
@@ -65,7 +65,8 @@ def _touch(
 ) -> Moving:
     """Contact, and contacts that are good until it acts again."""
     settings = simulation.self_contact
-    assert settings is not None and contacts is not None
+    assert settings is not None
+    assert contacts is not None
     halo, count = simulation.springs.halo, len(simulation.mass)
     position, velocity = (array[:, halo : halo + count] for array in packed)
     seconds = settings.interval * simulation.time_step

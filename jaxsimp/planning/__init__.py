@@ -2,6 +2,8 @@
 
 from jaxsimp.planning.actions import ENCODINGS, ActionSpace, Categorical, Encoding, GaussianIndex
 from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.engine import Engine, MassSprings
+from jaxsimp.planning.ensemble import Ensemble, Spread, make_ensemble
 from jaxsimp.planning.plan import Execution, Plan, Planner, load_plan, save_plan
 from jaxsimp.planning.population import Layout, PopulationMap, default_layout
 
@@ -11,15 +13,20 @@ __all__ = [
     "CEMConfig",
     "Categorical",
     "Encoding",
+    "Engine",
+    "Ensemble",
     "Execution",
     "GaussianIndex",
     "Layout",
+    "MassSprings",
     "Plan",
     "Planner",
     "PopulationMap",
     "Search",
+    "Spread",
     "default_layout",
     "load_plan",
+    "make_ensemble",
     "save_plan",
     "search",
 ]

@@ -14,20 +14,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
-from jaxsimp.dynamics import (
-    NONE,
-    Actions,
-    Pickers,
-    Simulation,
-    State,
-    at_rest,
-    make_pickers,
-    rollout,
-)
+from jaxsimp.dynamics import NONE, Actions, State, at_rest
 from jaxsimp.planning.actions import ActionSpace, Encoding
 from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.engine import Engine, MassSprings
+from jaxsimp.planning.ensemble import Ensemble, over_members
 from jaxsimp.planning.population import Layout, PopulationMap, default_layout
 from jaxsimp.tasks import Episode, Task, score
 
@@ -72,6 +65,7 @@ class Planner:
         task: what is planned for.
         config: settings of the search.
         layout: of the population on this machine.
+        ensemble: of physics that plans are costed in, if it is not the task's own alone.
         compile_seconds: that compiling the rollouts took.
     """
 
@@ -80,9 +74,9 @@ class Planner:
         task: Task,
         config: CEMConfig,
         layout: Layout | None = None,
-        *,
-        plan_contact: bool = False,
-        execute_contact: bool = False,
+        engine: Engine | None = None,
+        ensemble: Ensemble | None = None,
+        judge: Engine | None = None,
     ) -> None:
         """Compile the task's rollouts for the population of `config`.
 
@@ -90,23 +84,33 @@ class Planner:
             task: what is planned for.
             config: settings of the search.
             layout: of the population on this machine; by default the one measured to be best.
-            plan_contact: whether the body touches itself while plans are searched for.
-            execute_contact: whether it does while a plan is carried out.
+            engine: that carries out the plans of the search; by default our own dynamics.
+            ensemble: of physics that plans are costed in; by default the task's own alone.
+            judge: engine that executes the plan found; by default that of the search.
 
         Raises:
-            ValueError: if self-contact is asked for and refused, see `Task.simulation`.
+            ValueError: if an engine refuses the task, or that of the search is another's and there
+                is an ensemble.
         """
-        self.task, self.config = task, config
-        simulation = task.simulation(self_contact=plan_contact)
-        self._physics = simulation, _pickers(task)
-        self._executed = task.simulation(self_contact=execute_contact), _pickers(task)
-        episode = self._episode(task.episode_fn(0))
-        shared = (self._physics, episode)
+        self.task, self.config, self.ensemble = task, config, ensemble
+        engine = engine or MassSprings()
+        ours = isinstance(engine, MassSprings)
+        if ensemble is not None and not ours:
+            raise ValueError(
+                f"engine is {engine}, and an ensemble is of our own dynamics; leave one of them out"
+            )
+        judge = judge or engine
+        self._cost_physics, self._physics = engine.physics(task), judge.physics(task)
+        simulation = self._cost_physics[0] if ours else task.simulation()
         self.layout = layout or default_layout(config.population, simulation)
+        cost_fn: Callable[..., Array] = partial(_plan_cost, task, engine)
+        if ensemble is not None:
+            self._cost_physics, cost_fn = ensemble.physics(task), over_members(cost_fn)
+        episode = self._episode(task.episode_fn(0))
+        costed, executed = (self._cost_physics, episode), (self._physics, episode)
         one = jax.tree.map(lambda array: array[:1], self._idle())
-        self._costs = PopulationMap(partial(_plan_cost, task), shared, self._idle(), self.layout)
-        executed = (self._executed, episode)
-        self._execution = PopulationMap(partial(_execute, task), executed, one, Layout())
+        self._costs = PopulationMap(cost_fn, costed, self._idle(), self.layout)
+        self._execution = PopulationMap(partial(_execute, task, judge), executed, one, Layout())
         self.compile_seconds = self._costs.compile_seconds + self._execution.compile_seconds
 
     def plan(
@@ -132,13 +136,12 @@ class Planner:
             self.task.num_actions,
             self.task.num_pickers,
         )
-        shared = (self._physics, self._episode(episode))
         key = jax.random.key(seed)
         start = time.perf_counter()
         once = dataclasses.replace(self.config, num_iterations=1, initial_populations=1)
         search(space, encoding, once, key, lambda actions: np.zeros(len(actions.pick)))
         compiled = time.perf_counter()
-        costs = partial(self._costs, shared)
+        costs = partial(self.costs, episode)
         found = search(space, encoding, self.config, key, costs, on_population)
         return Plan(
             actions=found.actions,
@@ -147,16 +150,26 @@ class Planner:
             compile_seconds=compiled - start,
         )
 
+    def costs(self, episode: Episode, actions: Actions) -> Float[np.ndarray, " B"]:
+        """Costs of plans, at most as many as the population: what the search minimises.
+
+        Args:
+            episode: start and goal.
+            actions: the plans, shapes (B, T, G) and (B, T, G, 3).
+        """
+        costs = self._costs((self._cost_physics, self._episode(episode)), actions)
+        return costs if self.ensemble is None else self.ensemble.cost(costs)
+
     def estimate_seconds(self) -> float:
         """Seconds that a plan takes, from one evaluation of a population that does nothing."""
-        shared = (self._physics, self._episode(self.task.episode_fn(0)))
+        episode = self.task.episode_fn(0)
         start = time.perf_counter()
-        self._costs(shared, self._idle())
+        self.costs(episode, self._idle())
         return (time.perf_counter() - start) * self.config.num_populations
 
     def execute(self, episode: Episode, actions: Actions) -> Execution:
         """Carry out a plan, let the body settle, and score it."""
-        shared = (self._executed, self._episode(episode))
+        shared = (self._physics, self._episode(episode))
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
         (positions,), (value,), missed = self._execution(shared, one)
         return Execution(positions, float(value), None if missed is None else int(missed[0]))
@@ -174,35 +187,31 @@ class Planner:
         return np.dtype(jnp.result_type(float))
 
 
-def _pickers(task: Task) -> Pickers:
-    return make_pickers(task.limits, steps=task.action_steps)
-
-
 def _plan_cost(
-    task: Task, shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
+    task: Task, engine: Engine, shared: tuple[PyTree[Any], Episode], actions: Actions
 ) -> Float[Array, ""]:
     """Cost of a plan: the sum of the step costs over its actions (paper, IV-A).
 
     The state that is left when the pickers have let go counts as one more step.
     """
-    (simulation, pickers), episode = shared
+    physics, episode = shared
 
     def step_cost(state: State) -> Float[Array, ""]:
         return task.cost_fn(episode, state.position)
 
     start = at_rest(episode.start)
-    _, costs = rollout(simulation, pickers, start, _then_idle(actions, 1), step_cost)
+    _, costs = engine.rollout(physics, start, _then_idle(actions, 1), step_cost)
     return costs.sum()
 
 
 def _execute(
-    task: Task, shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
+    task: Task, engine: Engine, shared: tuple[PyTree[Any], Episode], actions: Actions
 ) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""], Int[Array, ""] | None]:
     """Positions at the start, after each action and settled, score of the last, and `missed`."""
-    (simulation, pickers), episode = shared
+    physics, episode = shared
     start = at_rest(episode.start)
     followed = _then_idle(actions, task.settle_actions)
-    final, positions = rollout(simulation, pickers, start, followed)
+    final, positions = engine.rollout(physics, start, followed, lambda state: state.position)
     during = positions[: task.num_actions]
     positions = jnp.concatenate([start.position[None], during, final.position[None]])
     return positions, score(task, episode, final.position), final.missed

@@ -88,6 +88,8 @@ class PopulationMap:
 
     Attributes:
         compile_seconds: that compilation took.
+        temporary_bytes: that the compiled function sets aside while a worker runs it; 0 where
+            the backend does not say.
     """
 
     def __init__(
@@ -137,6 +139,8 @@ class PopulationMap:
             for device in dict.fromkeys(self._devices)
         }
         self.compile_seconds = time.perf_counter() - start
+        memory = self._compiled[self._devices[0]].memory_analysis()
+        self.temporary_bytes = int(memory.temp_size_in_bytes) if memory else 0
 
     def __call__(self, shared: PyTree[Any], batch: PyTree[Any]) -> PyTree[np.ndarray]:
         """The function's values on a population, leading axis `B`, on the host.

@@ -42,5 +42,5 @@ def matching_distance(
 def distance(difference: Float[Array, "*M 3"]) -> Float[Array, "*M"]:
     """Euclidean length, with a finite gradient where it is zero."""
     squared = jnp.sum(jnp.square(difference), axis=-1)
-    apart = squared > 0
+    apart = squared != 0  # a distance that is not a number stays none
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)

@@ -11,7 +11,13 @@ from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.body import Body
-from jaxsimp.dynamics import Simulation, largest_time_step, make_simulation
+from jaxsimp.dynamics import (
+    Pickers,
+    Simulation,
+    largest_time_step,
+    make_pickers,
+    make_simulation,
+)
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
@@ -78,6 +84,10 @@ class Task:
     def top_speed(self) -> float:
         """Fastest that a picker moves, metres per second: at the middle of its longest way."""
         return 1.5 * float(np.linalg.norm(self.limits)) / self.action_seconds
+
+    def pickers(self) -> Pickers:
+        """How the pickers may move, at the task's time step."""
+        return make_pickers(self.limits, steps=self.action_steps)
 
     @property
     def time_step(self) -> float:

@@ -130,6 +130,19 @@ def test_vmap_of_the_gradient_is_a_loop_over_it(names, by_neighbour, monkeypatch
         assert apart > 1e-3 * np.abs(together[name]).max()
 
 
+@pytest.mark.slow
+def test_memory_grows_with_the_square_root_of_the_steps():
+    def memory(steps: int) -> int:
+        loss, inputs = problem(cloth((7, 7), (0.1, 0.1)), 1e-3, [0, NONE], steps=steps)
+        # What is set aside is decided after optimisation, of which there may be little.
+        options = {"xla_backend_optimization_level": 0}
+        gradient = jax.jit(jax.grad(lambda inputs: loss(inputs)[0]), compiler_options=options)
+        return gradient.lower(inputs).compile().memory_analysis().temp_size_in_bytes
+
+    # Sixteen times the steps: four times the states, and something that does not grow.
+    assert memory(1024) <= 4.2 * memory(64)
+
+
 def awkward_starts(body: Body) -> dict[str, np.ndarray]:
     flat = goals.flat(body)
     pair, line = flat.copy(), flat.copy()

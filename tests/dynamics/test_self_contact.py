@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache, partial
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,13 @@ from jaxsimp.dynamics.self_contact import find_contacts, resolve
 from jaxsimp.planning import default_layout
 from jaxsimp.tasks import make_task
 
-NOTHING = dict(mass=1.0, stretch_stiffness=1.0, bend_stiffness=0.0, damping=0.0, drag=0.0)
+NOTHING = {
+    "mass": 1.0,
+    "stretch_stiffness": 1.0,
+    "bend_stiffness": 0.0,
+    "damping": 0.0,
+    "drag": 0.0,
+}
 
 
 def two_pieces(first: Body, second: Body, **changes) -> Body:
@@ -113,7 +120,7 @@ def pair(gap: float, speed: float, *, sideways: float = 0.0, masses=(1.0, 3.0), 
     one = rope(3, 0.2, **NOTHING, friction=0.4)
     body = two_pieces(one, one)
     settings = make_self_contact(body, 1e-3, top_speed=2.0)
-    position = np.concatenate([one.rest, one.rest[:, [1, 0, 2]]]) + [0, 0, 1.0]
+    position = np.concatenate([one.rest, one.rest[:, [1, 0, 2]]]) + np.array([0.0, 0.0, 1.0])
     position[:3, 2] += float(settings.thickness) + gap
     velocity = np.zeros((6, 3))
     velocity[:3] = [sideways, 0, -speed]
@@ -187,8 +194,10 @@ def stacked(count: int, gap: float, **changes) -> tuple[Body, np.ndarray, np.nda
     for layer in range(1, count):
         body = two_pieces(body, one)
         # Turned a little, so that particles do not lie on particles.
-        position = np.concatenate([position, goals.flat(one, 0.2 * layer) + [0, 0, layer * gap]])
-    return body, position + [0, 0, one.radius], np.repeat(np.arange(count), 25)
+        position = np.concatenate(
+            [position, goals.flat(one, 0.2 * layer) + np.array([0.0, 0.0, layer * gap])]
+        )
+    return body, position + np.array([0.0, 0.0, one.radius]), np.repeat(np.arange(count), 25)
 
 
 def test_layers_rest_on_each_other():
@@ -227,14 +236,14 @@ def crossing(angle: float) -> tuple[Simulation, np.ndarray]:
         body, time_step, gravity=0.0, self_contact=True, top_speed=top_speed
     )
     turned = goals.turn(one.rest, np.pi / 2 + angle)
-    return simulation, np.concatenate([one.rest, turned]) + [0, 0, 1.0]
+    return simulation, np.concatenate([one.rest, turned]) + np.array([0.0, 0.0, 1.0])
 
 
 def height_of_first_over_second(position: np.ndarray) -> float:
     """Vertical distance of two ropes' middles where they cross as seen from above, or infinity."""
     first, second = (each[4:13] for each in np.split(np.asarray(position, dtype=np.float64), 2))
-    for a, b in zip(first[:-1], first[1:], strict=True):
-        for c, d in zip(second[:-1], second[1:], strict=True):
+    for a, b in pairwise(first):
+        for c, d in pairwise(second):
             matrix = np.stack([(b - a)[:2], (c - d)[:2]], axis=1)
             if abs(np.linalg.det(matrix)) < 1e-12:
                 continue
@@ -343,7 +352,9 @@ def laid_over():
     one = rope(9, 0.1)
     body = two_pieces(one, one)
     simulation = make_simulation(body, 1e-3, self_contact=True)
-    position = np.concatenate([one.rest, goals.turn(one.rest, 1.3) + [0.003, 0.002, 0.0085]])
+    position = np.concatenate(
+        [one.rest, goals.turn(one.rest, 1.3) + np.array([0.003, 0.002, 0.0085])]
+    )
     position[:, 2] += one.radius
     displacement = np.zeros((2, 3))
     displacement[0] = [0.01, 0.015, -0.004]

@@ -1,0 +1,95 @@
+"""Hand-made plans of the paper's tasks: what a fold or a pull that is surely right scores.
+
+A plan that was searched for may fail in another engine because of what the search exploited. A
+hand-made one fails only where the engines differ.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsimp.dynamics import NONE, Actions
+from jaxsimp.tasks import Episode, Task
+
+APEX = 0.12
+"""Height over which a fold is carried, metres."""
+Moves = dict[int, Float[np.ndarray, "3"]]
+"""Displacements by the particle that is picked, metres."""
+
+
+def scripted_plan(task: Task, episode: Episode) -> Actions:
+    """The hand-made plan of one of the paper's tasks.
+
+    Raises:
+        ValueError: if there is none for the task.
+    """
+    if task.name not in SCRIPTS:
+        raise ValueError(f"no plan is scripted for {task.name!r}; choose one of {list(SCRIPTS)}")
+    return _actions(task, SCRIPTS[task.name](task, episode))
+
+
+def _straighten(task: Task, episode: Episode) -> list[Moves]:
+    """Pull the two ends apart along the table, until they are as far as in the goal."""
+    last = task.body.num_particles - 1
+    apart, wanted = (
+        np.asarray(positions, float)[last] - np.asarray(positions, float)[0]
+        for positions in (episode.start, episode.goal)
+    )
+    longer = np.linalg.norm(wanted) / np.linalg.norm(apart) - 1
+    share = longer * apart / 2 / task.num_actions
+    return [{0: -share, last: share}] * task.num_actions
+
+
+def _fold_rope(task: Task, episode: Episode) -> list[Moves]:
+    """Pull the middle to the corner, then lay one end after the other."""
+    way, last = _ways(episode), task.body.num_particles - 1
+    middle = last // 2
+    half = way[middle] / 2
+    both = {0: way[0] / 2, last: way[last] / 2}
+    return [{middle: half}, both, {middle: half}, both]
+
+
+def _fold_sideways(task: Task, episode: Episode) -> list[Moves]:
+    """Carry the two corners of the moving edge onto those of the edge that lies still."""
+    return _carry_over(task, episode, (0, task.body.shape[1] - 1))
+
+
+def _fold_diagonally(task: Task, episode: Episode) -> list[Moves]:
+    """Carry a corner onto the opposite one."""
+    return _carry_over(task, episode, (0,))
+
+
+def _carry_over(task: Task, episode: Episode, corners: tuple[int, ...]) -> list[Moves]:
+    """Up and half the way, then the other half and down to just above the layer below."""
+    way, up = _ways(episode), np.array([0.0, 0.0, APEX])
+    gap = np.array([0.0, 0.0, 3 * task.body.radius])
+    return [
+        {corner: way[corner] / 2 + up for corner in corners},
+        {corner: way[corner] / 2 - up + gap for corner in corners},
+    ]
+
+
+def _ways(episode: Episode) -> Float[np.ndarray, "N 3"]:
+    """From the start to the goal, metres."""
+    return np.asarray(episode.goal, float) - np.asarray(episode.start, float)
+
+
+def _actions(task: Task, moves: list[Moves]) -> Actions:
+    """A plan of the task's length from what each of its first actions does."""
+    shape = (task.num_actions, task.num_pickers)
+    pick, displacement = np.full(shape, NONE), np.zeros((*shape, 3))
+    for t, each in enumerate(moves[: task.num_actions]):
+        pick[t, : len(each)] = list(each)
+        displacement[t, : len(each)] = list(each.values())
+    return Actions(jnp.asarray(pick), jnp.asarray(displacement))
+
+
+SCRIPTS: dict[str, Callable[[Task, Episode], list[Moves]]] = {
+    "rope_straightening": _straighten,
+    "rope_folding": _fold_rope,
+    "cloth_side_folding": _fold_sideways,
+    "cloth_diagonal_folding": _fold_diagonally,
+}
+"""What each action of a task's plan does."""

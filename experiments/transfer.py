@@ -1,0 +1,220 @@
+"""The study of transfer: plans found in our dynamics, carried out in MuJoCo.
+
+Each plan is replayed in both variants of `jaxsimp.engines.flex`. Plans that were scripted by hand
+are scored in all three, too: where those transfer and those that were found do not, the search
+has exploited our dynamics; where neither does, the engines differ.
+"""
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from experiments import plans, records
+from experiments.scripted import SCRIPTS, scripted_plan
+from jaxsimp.dynamics import Actions
+from jaxsimp.engines.flex import VARIANTS
+from jaxsimp.engines.replay import Replay, replay
+from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
+from jaxsimp.tasks import Task, score
+
+ROWS_FILE = "replays.jsonl"
+REPLAYS_FOLDER = "replays"
+SCRIPTED = "scripted"
+"""The action space of plans that were made by hand."""
+CHUNK = 8
+"""Plans replayed at a time, a row on disk after each; it changes no result."""
+SCRIPTED_SEEDS = 3
+"""Seeds of the plans made by hand: a fold starts flat, and differs by how it is turned."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """One configuration of the study.
+
+    Attributes:
+        plans: the study whose plans are replayed.
+        source: folder of its results; None if they are found in the folder of this study.
+        success_score: least settled score of a plan that transfers.
+    """
+
+    plans: plans.Study
+    source: str | None
+    success_score: float
+
+    def identity(self) -> dict[str, Any]:
+        """What two folders of results must share: the plans, and the models of MuJoCo."""
+        variants = {name: dataclasses.asdict(variant) for name, variant in VARIANTS.items()}
+        return {
+            "source": self.source,
+            "success_score": self.success_score,
+            "variants": variants,
+            "plans": self.plans.identity(),
+        }
+
+    def scripted(self) -> Iterator[tuple[str, int]]:
+        """Task and seed of the scripted plans."""
+        for name in self.plans.tasks:
+            if name in SCRIPTS:
+                yield from ((name, seed) for seed in range(min(self.plans.seeds, SCRIPTED_SEEDS)))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A plan to replay: its row of results so far, and where its arrays are."""
+
+    row: dict[str, Any]
+    path: Path
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """What tells it from other plans."""
+        return _key(self.row)
+
+
+def planned_study(folder: Path) -> plans.Study:
+    """The study of plans that a folder holds the results of.
+
+    Raises:
+        ValueError: if it does not.
+    """
+    try:
+        config = json.loads((folder / records.CONFIG_FILE).read_text())
+        names = [field.name for field in dataclasses.fields(plans.Study)]
+        settings = {name: config[name] for name in names}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{folder} holds no plans ({type(error).__name__}: {error}); give the folder of a "
+            f"study of plans, as results/paper"
+        ) from error
+    lists = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
+    return plans.Study(**{**settings, **lists})
+
+
+def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+    """Plan and replay what is not in the folder yet, and return the summary of everything."""
+    if study.source is None:
+        found, source = plans.run_study(study.plans, folder, console)["runs"], folder
+    else:
+        source = Path(study.source)
+        found = records.read_rows(source / plans.ROWS_FILE)
+    cases = [Case(_row_of_plan(row), source / row["plan"]) for row in found]
+    cases += _scripted_cases(study, folder, console)
+    _replay_all(study, cases, folder, console)
+    rows = {_key(row): row for row in records.read_rows(folder / ROWS_FILE)}
+    ordered = [rows[case.key] for case in cases]
+    return {
+        "environment": records.environment(),
+        "transfer": [row for row in ordered if row["action_space"] != SCRIPTED],
+        "scripted": [row for row in ordered if row["action_space"] == SCRIPTED],
+    }
+
+
+def _row_of_plan(row: dict[str, Any]) -> dict[str, Any]:
+    """What a replay's row takes over from that of its plan."""
+    names = ("task", "seed", "action_space", "pick_encoding", "final_score", "plan")
+    return {"planning": row.get("planning", "nominal")} | {name: row[name] for name in names}
+
+
+def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
+    """Plans made by hand, carried out in our dynamics where they are not on disk yet."""
+    (folder / plans.PLANS_FOLDER).mkdir(exist_ok=True)
+    cases, planners = [], {}
+    for name, seed in study.scripted():
+        path = folder / plans.PLANS_FOLDER / f"{name}-{SCRIPTED}-{seed}.npz"
+        task = study.plans.task(name)
+        episode = task.episode_fn(seed)
+        if not path.exists():
+            if name not in planners:
+                console.print(f"{name}: plans made by hand")
+                planners[name] = _executor(task)
+            actions = scripted_plan(task, episode)
+            execution = planners[name].execute(episode, actions)
+            save_plan(path, actions, execution.positions)
+        settled = load_plan(path)[1]["positions"][-1].astype(float)
+        value = float(score(task, episode, jnp.asarray(settled)))
+        row = {
+            "planning": SCRIPTED,
+            "task": name,
+            "seed": seed,
+            "action_space": SCRIPTED,
+            "pick_encoding": None,
+            "final_score": _finite(value),
+            "plan": f"{plans.PLANS_FOLDER}/{path.name}",
+        }
+        cases.append(Case(row, path))
+    return cases
+
+
+def _executor(task: Task) -> Planner:
+    """Carries out plans in our dynamics, and searches for none."""
+    return Planner(task, CEMConfig(1, 1, 1), Layout())
+
+
+def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console) -> None:
+    """Replay task by task what has no row yet."""
+    (folder / REPLAYS_FOLDER).mkdir(exist_ok=True)
+    done = {_key(row) for row in records.read_rows(folder / ROWS_FILE)}
+    left = [case for case in cases if case.key not in done]
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("replays in MuJoCo", total=len(left))
+        for name in study.plans.tasks:
+            task = study.plans.task(name)
+            of_task = [case for case in left if case.row["task"] == name]
+            for first in range(0, len(of_task), CHUNK):
+                for row in _replay_chunk(task, of_task[first : first + CHUNK], folder):
+                    records.append_row(folder / ROWS_FILE, row)
+                    progress.advance(bar)
+
+
+def _replay_chunk(task: Task, cases: list[Case], folder: Path) -> list[dict[str, Any]]:
+    """Replay a few plans in every variant, save the motions, and return the rows."""
+    episodes = [task.episode_fn(case.row["seed"]) for case in cases]
+    actions = [load_plan(case.path)[0] for case in cases]
+    found = {name: replay(task, episodes, actions, name) for name in VARIANTS}
+    rows = []
+    for index, case in enumerate(cases):
+        replays = {name: results[index] for name, results in found.items()}
+        for name, result in replays.items():
+            _save(folder, case, name, actions[index], result)
+        rows.append(case.row | _fields(replays))
+    return rows
+
+
+def _fields(replays: dict[str, Replay]) -> dict[str, Any]:
+    """What replays add to a row."""
+    warnings = [f"{name}: {each}" for name, one in replays.items() for each in one.warnings]
+    scores = {f"mujoco_{name}_score": _finite(one.score) for name, one in replays.items()}
+    status = {f"mujoco_{name}_status": one.status.name for name, one in replays.items()}
+    return scores | status | {"warnings": warnings}
+
+
+def _save(folder: Path, case: Case, variant: str, actions: Actions, result: Replay) -> None:
+    save_plan(replay_path(folder, case.row, variant), actions, result.positions)
+
+
+def replay_path(folder: Path, row: dict[str, Any], variant: str) -> Path:
+    """Where the motion of a replay is."""
+    return folder / REPLAYS_FOLDER / f"{Path(row['plan']).stem}-{variant}.npz"
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no numbers that are none: null."""
+    return value if np.isfinite(value) else None
+
+
+def _key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("task", "action_space", "pick_encoding", "seed"))

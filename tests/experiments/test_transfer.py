@@ -1,0 +1,150 @@
+"""The study of transfer: what it leaves behind, going on, replaying an earlier study's plans."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib.image
+import numpy as np
+import pytest
+
+from experiments import run
+from experiments.scripted import SCRIPTS, scripted_plan
+from experiments.transfer import planned_study, replay_path
+from jaxsimp.planning import load_plan
+from jaxsimp.tasks import make_task, score, task_names
+
+TASKS = ("rope_straightening", "cloth_diagonal_folding")
+OPTIONS = (
+    *("transfer", "--tasks", *TASKS, "--seeds", "1", "--resolution", "7", "--num-actions", "1"),
+    *("--population", "4", "--num-iterations", "1"),
+)
+
+
+def command(*options: str) -> int:
+    """What `python -m experiments.run` does, without another process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["experiments.run", *map(str, options)])
+        return run.main()
+
+
+def finished(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The results of a tiny study."""
+    folder = tmp_path_factory.mktemp("results") / "tiny"
+    assert command(*OPTIONS, "--out", folder) == 0
+    return folder
+
+
+@pytest.mark.slow
+def test_summary_has_its_schema(folder):
+    summary = finished(folder)
+    assert summary.keys() == {"environment", "transfer", "scripted"}
+    assert summary["environment"]["versions"]["mujoco"]
+    fields = {
+        *("task", "seed", "action_space", "final_score", "mujoco_fast_score"),
+        *("mujoco_full_score", "warnings", "planning"),
+    }
+    for name, space in (("transfer", "key_points"), ("scripted", "scripted")):
+        rows = summary[name]
+        assert [row["task"] for row in rows] == list(TASKS)
+        for row in rows:
+            assert fields <= row.keys()
+            assert row["action_space"] == space
+            assert row["warnings"] == []
+    assert {row["planning"] for row in summary["transfer"]} == {"nominal"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["fast", "full"])
+def test_scores_are_those_of_the_settled_positions(folder, variant):
+    summary = finished(folder)
+    for row in [*summary["transfer"], *summary["scripted"]]:
+        task, episode = make_task(row["task"], 7), make_task(row["task"], 7).episode_fn(0)
+        for path, found in (
+            (folder / row["plan"], row["final_score"]),
+            (replay_path(folder, row, variant), row[f"mujoco_{variant}_score"]),
+        ):
+            last = load_plan(path)[1]["positions"][-1]
+            expected = float(score(task, episode, jnp.asarray(last, dtype=float)))
+            assert found == pytest.approx(expected, abs=1e-5)  # float32, compiled otherwise
+
+
+@pytest.mark.slow
+def test_report_and_figures_are_there(folder):
+    report = (folder / "report.md").read_text()
+    names = {path.stem for path in (folder / "figures").iterdir()}
+    shown = {f"{kind}_{task}" for kind in ("median", "worst", "by_hand") for task in TASKS}
+    assert names == {"transfer", *shown}
+    for name in names:
+        assert f"(figures/{name}.png)" in report
+        assert len(np.unique(matplotlib.image.imread(folder / "figures" / f"{name}.png"))) > 10
+    for task in TASKS:
+        assert report.count(f"| {task} |") == 2
+
+
+@pytest.mark.slow
+def test_a_study_cut_short_goes_on_to_the_same_rows(folder, tmp_path):
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    (copy / "summary.json").unlink()
+    lines = (copy / "replays.jsonl").read_text().splitlines(keepends=True)
+    (copy / "replays.jsonl").write_text("".join(lines[:2]) + lines[2][:20])
+    assert command(*OPTIONS, "--out", copy) == 0
+    assert finished(copy)["transfer"] == finished(folder)["transfer"]
+    assert finished(copy)["scripted"] == finished(folder)["scripted"]
+
+
+@pytest.mark.slow
+def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
+    # The folder of a study of transfer holds plans as any other study's does, but for the
+    # configuration, which is the one of the study inside.
+    source = Path(shutil.copytree(folder, tmp_path / "paper"))
+    config = json.loads((source / "config.json").read_text())
+    (source / "config.json").write_text(json.dumps(config["plans"]))
+    out = tmp_path / "again"
+    assert command("transfer", "--plans", source, "--out", out) == 0
+    assert not (out / "runs.jsonl").exists()
+    assert finished(out)["transfer"] == finished(folder)["transfer"]
+
+
+def test_a_folder_without_plans_is_refused(tmp_path, capsys):
+    with pytest.raises(ValueError, match="holds no plans"):
+        planned_study(tmp_path)
+    assert command("transfer", "--plans", tmp_path, "--out", tmp_path / "new") == 2
+    assert "holds no plans" in " ".join(
+        capsys.readouterr().err.split()
+    )  # as the terminal breaks it
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("name", task_names("paper"))
+def test_a_scripted_plan_is_within_the_limits_of_its_task(name):
+    task = make_task(name, quick=True)
+    for seed in range(3):
+        plan = scripted_plan(task, task.episode_fn(seed))
+        assert plan.pick.shape == (task.num_actions, task.num_pickers)
+        # A diagonal fold of a cloth that is turned by 45 degrees is longer than two actions
+        # reach, by a fifteenth; that is clipped.
+        assert np.all(np.abs(plan.displacement) <= 1.07 * np.asarray(task.limits))
+
+
+def test_a_scripted_fold_ends_above_its_goal():
+    task = make_task("cloth_diagonal_folding", quick=True)
+    episode = task.episode_fn(3)
+    plan = scripted_plan(task, episode)
+    end = np.asarray(episode.start)[0] + np.asarray(plan.displacement)[:, 0].sum(axis=0)
+    expected = np.asarray(episode.goal)[0] + [0.0, 0.0, 3 * task.body.radius]
+    np.testing.assert_allclose(end, expected, rtol=0, atol=1e-6)  # float32
+
+
+def test_a_task_without_a_script_is_refused():
+    task = make_task("rope_letter_m", 9)
+    assert task.name not in SCRIPTS
+    with pytest.raises(ValueError, match="no plan is scripted for 'rope_letter_m'; choose one"):
+        scripted_plan(task, task.episode_fn(0))
