@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from experiments import records
-from experiments.benchmark import planning, rollouts
+from experiments.benchmark import contact, planning, rollouts
 from experiments.benchmark.measure import FULL, QUICK, Row, Scale
 
 SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
@@ -26,6 +26,7 @@ SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
     "line_fit": planning.line_fit,
     "cold_start": planning.cold_start,
     "scaling": rollouts.scaling,
+    "self_contact": contact.self_contact,
 }
 INTERRUPTED = 130
 """Exit status of a program that Ctrl-C ended, as shells have it."""

@@ -13,8 +13,9 @@ from jaxtyping import PyTree
 
 from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, speed_profile
 from jaxsimp.dynamics.simulation import Simulation, State
-from jaxsimp.dynamics.step import Motion, Packed, pack, unpack
+from jaxsimp.dynamics.step import Motion, unpack
 from jaxsimp.dynamics.steps import plain_steps, steps
+from jaxsimp.dynamics.touching import Moving, begin, end, touching_steps
 
 
 def rollout(
@@ -41,23 +42,24 @@ def rollout(
         The state at the end of the last action, and the observations stacked along a first
         axis of length T; by default the positions, shape (T, N, 3).
     """
+    advance = steps if adjoint else plain_steps
 
-    def act(packed: Packed, action: Actions) -> tuple[Packed, PyTree[Any]]:
-        position = unpack(simulation, packed).position
+    def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
+        position = unpack(simulation, moving[0]).position
         held, displacement = grasp(pickers, simulation.rest, simulation.radius, position, action)
-        drive = displacement.T / simulation.time_step
-        advance = steps if adjoint else plain_steps
-        packed = advance(simulation, packed, Motion(held, drive), speed_profile(pickers.steps))
-        return packed, observe(unpack(simulation, packed))
+        motion = Motion(held, displacement.T / simulation.time_step)
+        moving = touching_steps(advance, simulation, moving, motion, speed_profile(pickers.steps))
+        return moving, observe(end(simulation, moving))
 
-    packed, observations = jax.lax.scan(act, pack(simulation, state), actions)
-    return unpack(simulation, packed), observations
+    moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
+    return end(simulation, moving), observations
 
 
 def settle(simulation: Simulation, state: State, num_steps: int) -> State:
     """The state after `num_steps` time steps with nothing held."""
-    packed = pack(simulation, state)
+    moving = begin(simulation, state)
     held = jnp.zeros(len(state.position), dtype=bool)
     drive = jnp.zeros_like(state.position.T)
     share = jnp.zeros(num_steps, dtype=drive.dtype)
-    return unpack(simulation, steps(simulation, packed, Motion(held, drive), share))
+    moving = touching_steps(steps, simulation, moving, Motion(held, drive), share)
+    return end(simulation, moving)

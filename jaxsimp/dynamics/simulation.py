@@ -6,27 +6,48 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsimp.body import Body
+from jaxsimp.dynamics.layers import TOP_SPEED, SelfContact, make_self_contact
 from jaxsimp.dynamics.springs import Springs, make_springs
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=["position", "velocity"], meta_fields=[])
-@dataclass(frozen=True)
-class State:
-    """Positions, metres, and velocities, metres per second, of the particles, shape (N, 3).
-
-    Here and below `...` stands for the axes that `jax.vmap` and `jax.lax.map` add.
-    """
-
-    position: Float[Array, "... N 3"]
-    velocity: Float[Array, "... N 3"]
 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["springs", "rest", "mass", "radius", "drag", "friction", "gravity", "time_step"],
+    data_fields=["position", "velocity", "missed"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class State:
+    """A body in motion.
+
+    Here and below `...` stands for the axes that `jax.vmap` and `jax.lax.map` add.
+
+    Attributes:
+        position: shape (N, 3), metres.
+        velocity: shape (N, 3), metres per second.
+        missed: what self-contact did not hold back so far, see `Contacts`; None without it.
+    """
+
+    position: Float[Array, "... N 3"]
+    velocity: Float[Array, "... N 3"]
+    missed: Int[Array, "..."] | None = None
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "springs",
+        "rest",
+        "mass",
+        "radius",
+        "drag",
+        "friction",
+        "gravity",
+        "time_step",
+        "self_contact",
+    ],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -42,6 +63,7 @@ class Simulation:
         friction: Coulomb coefficient with the table.
         gravity: downward acceleration, metres per second squared.
         time_step: seconds.
+        self_contact: how the body touches itself; None where it passes through itself.
     """
 
     springs: Springs
@@ -52,19 +74,31 @@ class Simulation:
     friction: Float[Array, "..."]
     gravity: Float[Array, "..."]
     time_step: Float[Array, "..."]
+    self_contact: SelfContact | None = None
 
 
-def make_simulation(body: Body, time_step: float = 2e-3, gravity: float = 9.81) -> Simulation:
+def make_simulation(
+    body: Body,
+    time_step: float = 2e-3,
+    gravity: float = 9.81,
+    *,
+    self_contact: bool = False,
+    top_speed: float = TOP_SPEED,
+) -> Simulation:
     """The simulation of a body.
 
     Args:
         body: what is simulated.
         time_step: seconds, at most `largest_time_step(body)`.
         gravity: downward acceleration, metres per second squared.
+        self_contact: whether layers rest on each other and rub, see `make_self_contact`; the
+            body passes through itself otherwise.
+        top_speed: fastest that a picker moves, metres per second; matters to self-contact only.
 
     Raises:
         ValueError: if the time step is not positive, or is unstable for the body's stiffness,
-            damping, drag and mass; or if gravity is not finite.
+            damping, drag and mass; if gravity is not finite; or if the body has no thickness, or
+            pickers are too fast, for self-contact.
     """
     largest = largest_time_step(body)
     if not 0 < time_step <= largest:
@@ -89,6 +123,9 @@ def make_simulation(body: Body, time_step: float = 2e-3, gravity: float = 9.81) 
         friction=array(body.friction),
         gravity=array(gravity),
         time_step=array(time_step),
+        self_contact=(
+            make_self_contact(body, time_step, top_speed=top_speed) if self_contact else None
+        ),
     )
 
 

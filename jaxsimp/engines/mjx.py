@@ -188,21 +188,16 @@ def _mjx() -> Any:
 class MJX:
     """MJX as the engine of a planner: `Planner(task, config, engine=MJX())`.
 
-    For ropes and small cloths, with patience: bodies of more than `MOST_PARTICLES` are refused, and
-    so is self-collision, which MJX does not have.
+    For ropes and small cloths, with patience: bodies of more than `MOST_PARTICLES` are refused.
+    They pass through themselves: MJX has no flexible bodies.
     """
 
     def physics(self, task: Task) -> tuple[MJXSimulation, Pickers]:
         """The task's simulation in MJX, and its pickers.
 
         Raises:
-            ValueError: if the body has too many particles, or its simulation self-collision.
+            ValueError: if the body has too many particles.
         """
-        if getattr(task.simulation(), "self_contact", None) is not None:
-            raise ValueError(
-                f"the simulation of {task.name} has self-collision; MJX has none. Turn it off, or "
-                f"take our own dynamics"
-            )
         return make_mjx_simulation(task.body, task.time_step), task.pickers()
 
     def rollout(

@@ -45,11 +45,17 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class MassSprings:
-    """Our own dynamics, the engine of a planner by default."""
+    """Our own dynamics, the engine of a planner by default.
+
+    Attributes:
+        self_contact: whether the body touches itself, or passes through itself.
+    """
+
+    self_contact: bool = False
 
     def physics(self, task: Task) -> tuple[Simulation, Pickers]:
         """The task's simulation and pickers."""
-        return task.simulation(), task.pickers()
+        return task.simulation(self_contact=self.self_contact), task.pickers()
 
     def rollout(
         self, physics: tuple[Simulation, Pickers], state: State, actions: Actions, observe: Observe

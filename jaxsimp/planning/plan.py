@@ -50,10 +50,12 @@ class Execution:
     Attributes:
         positions: at the start, after each action, and settled, shape (T + 2, N, 3), metres.
         score: normalised score of the settled state.
+        missed: contacts whose particles got past each other; None without self-contact.
     """
 
     positions: Float[np.ndarray, "T2 N 3"]
     score: float
+    missed: int | None = None
 
 
 class Planner:
@@ -74,6 +76,7 @@ class Planner:
         layout: Layout | None = None,
         engine: Engine | None = None,
         ensemble: Ensemble | None = None,
+        judge: Engine | None = None,
     ) -> None:
         """Compile the task's rollouts for the population of `config`.
 
@@ -81,31 +84,33 @@ class Planner:
             task: what is planned for.
             config: settings of the search.
             layout: of the population on this machine; by default the one measured to be best.
-            engine: that carries out the plans; by default our own dynamics.
+            engine: that carries out the plans of the search; by default our own dynamics.
             ensemble: of physics that plans are costed in; by default the task's own alone.
-                Plans are executed in the task's own.
+            judge: engine that executes the plan found; by default that of the search.
 
         Raises:
-            ValueError: if the engine refuses the task, or is another's and there is an ensemble.
+            ValueError: if an engine refuses the task, or that of the search is another's and there
+                is an ensemble.
         """
         self.task, self.config, self.ensemble = task, config, ensemble
         engine = engine or MassSprings()
-        if ensemble is not None and not isinstance(engine, MassSprings):
+        ours = isinstance(engine, MassSprings)
+        if ensemble is not None and not ours:
             raise ValueError(
                 f"engine is {engine}, and an ensemble is of our own dynamics; leave one of them out"
             )
-        self._physics = engine.physics(task)
-        shared = (self._physics, self._episode(task.episode_fn(0)))
-        self.layout = layout or default_layout(config.population, task.simulation())
-        one = jax.tree.map(lambda array: array[:1], self._idle())
+        judge = judge or engine
+        self._cost_physics, self._physics = engine.physics(task), judge.physics(task)
+        simulation = self._cost_physics[0] if ours else task.simulation()
+        self.layout = layout or default_layout(config.population, simulation)
         cost_fn: Callable[..., Array] = partial(_plan_cost, task, engine)
-        self._cost_physics = self._physics
         if ensemble is not None:
             self._cost_physics, cost_fn = ensemble.physics(task), over_members(cost_fn)
-        costed = (self._cost_physics, shared[1])
+        episode = self._episode(task.episode_fn(0))
+        costed, executed = (self._cost_physics, episode), (self._physics, episode)
+        one = jax.tree.map(lambda array: array[:1], self._idle())
         self._costs = PopulationMap(cost_fn, costed, self._idle(), self.layout)
-        execute = partial(_execute, task, engine)
-        self._execution = PopulationMap(execute, shared, one, Layout())
+        self._execution = PopulationMap(partial(_execute, task, judge), executed, one, Layout())
         self.compile_seconds = self._costs.compile_seconds + self._execution.compile_seconds
 
     def plan(
@@ -166,8 +171,8 @@ class Planner:
         """Carry out a plan, let the body settle, and score it."""
         shared = (self._physics, self._episode(episode))
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
-        (positions,), (value,) = self._execution(shared, one)
-        return Execution(positions, float(value))
+        (positions,), (value,), missed = self._execution(shared, one)
+        return Execution(positions, float(value), None if missed is None else int(missed[0]))
 
     def _idle(self) -> Actions:
         """A population of plans that grasp nothing."""
@@ -201,15 +206,15 @@ def _plan_cost(
 
 def _execute(
     task: Task, engine: Engine, shared: tuple[PyTree[Any], Episode], actions: Actions
-) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""]]:
-    """Positions at the start, after each action and settled, and the score of the last."""
+) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""], Int[Array, ""] | None]:
+    """Positions at the start, after each action and settled, score of the last, and `missed`."""
     physics, episode = shared
     start = at_rest(episode.start)
     followed = _then_idle(actions, task.settle_actions)
     final, positions = engine.rollout(physics, start, followed, lambda state: state.position)
     during = positions[: task.num_actions]
     positions = jnp.concatenate([start.position[None], during, final.position[None]])
-    return positions, score(task, episode, final.position)
+    return positions, score(task, episode, final.position), final.missed
 
 
 def _then_idle(actions: Actions, count: int) -> Actions:

@@ -66,7 +66,9 @@ def default_layout(population: int, simulation: Simulation) -> Layout:
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         return Layout(chunk_size=-(-population // len(devices)), num_workers=len(devices))
-    alone = simulation.springs.offsets and len(simulation.mass) > MOST_CHUNKED_PARTICLES
+    large = simulation.springs.offsets and len(simulation.mass) > MOST_CHUNKED_PARTICLES
+    # Only a sample by itself looks its contacts up no more often than it must.
+    alone = large or simulation.self_contact is not None
     return Layout(
         chunk_size=1 if alone else min(CHUNK_SIZE, population),
         num_workers=max(_num_cores(), len(devices)),

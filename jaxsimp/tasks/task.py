@@ -67,9 +67,23 @@ class Task:
     def __post_init__(self) -> None:
         goals.check_goal(self.body, self.goal)
 
-    def simulation(self) -> Simulation:
-        """The body's simulation, at the task's time step."""
-        return make_simulation(self.body, self.time_step)
+    def simulation(self, *, self_contact: bool = False) -> Simulation:
+        """The body's simulation, at the task's time step.
+
+        Args:
+            self_contact: whether the body touches itself, at speeds that the task allows.
+
+        Raises:
+            ValueError: if the body has no thickness, or pickers are too fast, for self-contact.
+        """
+        return make_simulation(
+            self.body, self.time_step, self_contact=self_contact, top_speed=self.top_speed
+        )
+
+    @property
+    def top_speed(self) -> float:
+        """Fastest that a picker moves, metres per second: at the middle of its longest way."""
+        return 1.5 * float(np.linalg.norm(self.limits)) / self.action_seconds
 
     def pickers(self) -> Pickers:
         """How the pickers may move, at the task's time step."""

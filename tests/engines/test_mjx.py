@@ -4,7 +4,6 @@ import dataclasses
 import subprocess
 import sys
 from functools import lru_cache
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +32,7 @@ from jaxsimp.engines import (
 )
 from jaxsimp.engines import mjx as mjx_module
 from jaxsimp.planning import ENCODINGS, CEMConfig, Engine, Layout, MassSprings, Planner
-from jaxsimp.tasks import Task, make_task
+from jaxsimp.tasks import make_task
 
 # MJX relies on rank promotion.
 pytestmark = pytest.mark.usefixtures("rank_promotion")
@@ -200,18 +199,6 @@ def test_a_large_body_is_refused_by_name():
 def test_an_unstable_time_step_is_refused():
     with pytest.raises(ValueError, match=r"time_step is 0\.1 s"):
         make_mjx_simulation(rope(5), 0.1)
-
-
-class Tangled(Task):
-    """A task whose simulation has self-collision."""
-
-    def simulation(self):
-        return SimpleNamespace(self_contact="on")
-
-
-def test_self_collision_is_refused_by_name():
-    with pytest.raises(ValueError, match="rope_folding has self-collision; MJX has none"):
-        MJX().physics(Tangled(**vars(small_task())))
 
 
 def test_a_flex_is_refused_by_name():

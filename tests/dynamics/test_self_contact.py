@@ -1,0 +1,427 @@
+"""Self-contact: who is near, who touches, what holds, and what it costs in gradients."""
+
+from dataclasses import replace
+from functools import cache, partial
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsimp import goals
+from jaxsimp.body import Body, cloth, rope
+from jaxsimp.dynamics import (
+    NONE,
+    Actions,
+    Simulation,
+    State,
+    at_rest,
+    largest_time_step,
+    make_pickers,
+    make_simulation,
+    rollout,
+    settle,
+)
+from jaxsimp.dynamics.layers import MOST_LAYERS_OF_ROPES, SPARE, make_self_contact
+from jaxsimp.dynamics.nearest import nearest_above
+from jaxsimp.dynamics.self_contact import find_contacts, resolve
+from jaxsimp.planning import default_layout
+from jaxsimp.tasks import make_task
+
+NOTHING = {
+    "mass": 1.0,
+    "stretch_stiffness": 1.0,
+    "bend_stiffness": 0.0,
+    "damping": 0.0,
+    "drag": 0.0,
+}
+
+
+def two_pieces(first: Body, second: Body, **changes) -> Body:
+    """Two bodies as one, which no spring joins."""
+    count = first.num_particles
+    joined = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in ("rest", "mass", "rest_length", "stiffness", "damping")
+    }
+    for name in ("springs", "faces"):
+        joined[name] = np.concatenate([getattr(first, name), getattr(second, name) + count])
+    return replace(
+        first, **joined, shape=(count + second.num_particles,), name="two pieces", **changes
+    )
+
+
+def colliding_distances(simulation: Simulation, position: np.ndarray) -> np.ndarray:
+    """Distances of all pairs that may touch, by brute force, in float64."""
+    position = np.asarray(position, dtype=np.float64)
+    apart = np.asarray(simulation.self_contact.apart, dtype=np.float64).T
+    now, rest = (
+        np.linalg.norm(points[:, None] - points[None], axis=-1) for points in (position, apart)
+    )
+    return now[rest > float(simulation.self_contact.adjacent)]
+
+
+# Who is near
+
+
+@pytest.mark.parametrize("count", [2, 37, 300])
+def test_nearest_is_that_of_all_pairs(count):
+    rng = np.random.default_rng(count)
+    position, apart = rng.uniform(-0.1, 0.1, (2, 3, count))
+    normal = rng.standard_normal((3, count))
+    normal /= np.linalg.norm(normal, axis=0)
+    adjacent, squash, level, reach = 0.05, 1.5, 0.002, 0.06
+    ids, distance = nearest_above(
+        *(jnp.asarray(each, jnp.float32) for each in (position, normal)),
+        jnp.asarray(apart, jnp.float32),
+        adjacent=jnp.float32(adjacent),
+        squash=jnp.float32(squash),
+        level=jnp.float32(level),
+        reach=jnp.float32(reach),
+    )
+    away = position[:, None] - position[:, :, None]
+    above = (normal[:, :, None] * away).sum(axis=0)
+    true = np.sqrt((away**2).sum(axis=0) + squash * above**2)
+    true[np.linalg.norm(apart[:, None] - apart[:, :, None], axis=0) < adjacent] = np.inf
+    np.fill_diagonal(true, np.inf)
+    true[above < -level] = np.inf
+    best = true.min(axis=1)
+    found = np.asarray(ids) != np.arange(count)
+    # Squares are told apart to N / 2^24 of the reach's: 5e-6 m^2 / 3600 here.
+    resolution = reach * np.sqrt(count / 2**24) + 1e-6
+    np.testing.assert_array_equal(found, best <= reach)
+    of_found = true[np.arange(count), ids][found]
+    assert np.all(np.abs(of_found - best[found]) < resolution)
+    assert np.all(np.abs(distance - np.minimum(best, reach)) < resolution)
+
+
+def test_nearest_above_finds_everybody_when_all_stand_in_one_column():
+    # Nothing is pruned: the widest axis has no width.
+    count = 50
+    ids, distance = nearest_above(
+        jnp.zeros((3, count)),
+        jnp.zeros((3, count)).at[2].set(1.0),
+        jnp.arange(3.0 * count).reshape(3, count),
+        adjacent=jnp.float32(0.5),
+        squash=jnp.float32(0.0),
+        level=jnp.float32(0.0),
+        reach=jnp.float32(0.01),
+    )
+    assert np.all(np.asarray(ids) != np.arange(count))
+    assert np.all(np.asarray(distance) == 0)
+
+
+# Two particles: closed forms
+
+
+def pair(gap: float, speed: float, *, sideways: float = 0.0, masses=(1.0, 3.0), held=False):
+    """Velocities and displacements of two ropes' middle particles, one above the other."""
+    one = rope(3, 0.2, **NOTHING, friction=0.4)
+    body = two_pieces(one, one)
+    settings = make_self_contact(body, 1e-3, top_speed=2.0)
+    position = np.concatenate([one.rest, one.rest[:, [1, 0, 2]]]) + np.array([0.0, 0.0, 1.0])
+    position[:3, 2] += float(settings.thickness) + gap
+    velocity = np.zeros((6, 3))
+    velocity[:3] = [sideways, 0, -speed]
+    inverse = 1 / np.repeat(masses, 3)
+    if held:
+        inverse[:3] = 0
+    position, velocity = jnp.asarray(position.T), jnp.asarray(velocity.T)
+    contacts = find_contacts(settings, position, jnp.zeros(6), jnp.zeros((), int))
+    _, moved, after = resolve(
+        settings,
+        contacts,
+        jnp.asarray(inverse),
+        jnp.asarray(0.004),
+        jnp.asarray(1e-3),
+        position,
+        velocity,
+    )
+    return np.asarray(moved - position), np.asarray(after), np.repeat(masses, 3)
+
+
+@pytest.mark.usefixtures("x64")
+def test_particles_that_meet_head_on_go_on_together():
+    moved, after, mass = pair(gap=0.0, speed=1.0)
+    # Perfectly inelastic: (1 * -1 + 3 * 0) / 4; the ends of the ropes do not touch.
+    np.testing.assert_allclose(after[2, [1, 4]], -0.25, rtol=1e-12)
+    np.testing.assert_allclose(after[2, [0, 2, 3, 5]], [-1, -1, 0, 0], atol=1e-12)
+    assert np.abs(moved).max() < 1e-12
+    np.testing.assert_allclose(after @ mass, [0, 0, -3], atol=1e-12)
+
+
+@pytest.mark.usefixtures("x64")
+def test_particles_close_no_more_than_their_gap():
+    _, after, _ = pair(gap=4e-4, speed=1.0)
+    # They may approach by 0.4 mm in 1 ms.
+    np.testing.assert_allclose(after[2, 4] - after[2, 1], 0.4, rtol=1e-9)
+    _, after, _ = pair(gap=1.5e-3, speed=1.0)
+    np.testing.assert_allclose(after[2, [1, 4]], [-1, 0], atol=1e-12)
+
+
+@pytest.mark.usefixtures("x64")
+def test_particles_too_close_are_moved_apart_about_their_centre_of_mass():
+    moved, after, mass = pair(gap=-1e-3, speed=0.0)
+    np.testing.assert_allclose(moved[2, [1, 4]], [0.75e-3, -0.25e-3], rtol=1e-9)
+    np.testing.assert_allclose(moved @ mass, 0, atol=1e-15)
+    np.testing.assert_allclose(after, 0, atol=1e-12)
+
+
+@pytest.mark.usefixtures("x64")
+def test_what_is_held_does_not_give_way():
+    _, after, _ = pair(gap=0.0, speed=1.0, held=True)
+    np.testing.assert_allclose(after[2, [1, 4]], -1, rtol=1e-12)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("sideways", [0.05, 2.0])
+def test_friction_is_coulombs(sideways):
+    _, after, mass = pair(gap=0.0, speed=1.0, sideways=sideways)
+    # Normal impulse 0.75; friction takes 0.4 of it, or half of what stops the sliding at once.
+    impulse = min(0.4 * 0.75, 0.5 * 0.75 * sideways)
+    np.testing.assert_allclose(after[0, [1, 4]], [sideways - impulse, impulse / 3], rtol=1e-9)
+    np.testing.assert_allclose(after @ mass, [3 * sideways, 0, -3], atol=1e-12)
+
+
+# Bodies
+
+
+def stacked(count: int, gap: float, **changes) -> tuple[Body, np.ndarray, np.ndarray]:
+    """Small cloths above each other: the body, positions, and which cloth each particle is of."""
+    one = cloth((5, 5), (0.05, 0.05), mass=8e-4, **changes)
+    body, position = one, one.rest
+    for layer in range(1, count):
+        body = two_pieces(body, one)
+        # Turned a little, so that particles do not lie on particles.
+        position = np.concatenate(
+            [position, goals.flat(one, 0.2 * layer) + np.array([0.0, 0.0, layer * gap])]
+        )
+    return body, position + np.array([0.0, 0.0, one.radius]), np.repeat(np.arange(count), 25)
+
+
+def test_layers_rest_on_each_other():
+    body, position, layer = stacked(4, 6e-3)
+    simulation = make_simulation(body, 1e-3, self_contact=True)
+    final = settle(simulation, at_rest(position), 600)
+    heights = [float(final.position[layer == each, 2].mean()) for each in range(4)]
+    # What lies on a layer presses it in by what it falls in a step or two, 0.02 mm each.
+    np.testing.assert_allclose(heights, 0.002 + SPARE * 0.004 * np.arange(4), atol=1e-4)
+    assert colliding_distances(simulation, final.position).min() > 0.8 * 0.004
+
+
+def test_a_sliding_layer_drags_the_one_below():
+    body, position, layer = stacked(2, 4e-3, drag=0.0)
+    simulation = make_simulation(body, 1e-3, self_contact=True)
+    contact = replace(simulation.self_contact, friction=jnp.asarray(0.2))
+    simulation = replace(simulation, friction=jnp.asarray(0.0), self_contact=contact)
+    speed = np.where(layer == 1, 0.15, 0.0)[:, None] * [1.0, 0, 0]
+    state = State(jnp.asarray(position, jnp.float32), jnp.asarray(speed, jnp.float32))
+    # Friction 0.2 m g on either: v - 0.2 g t and 0.2 g t, until both go at v / 2 from 0.038 s.
+    for steps, top, bottom in ((20, 0.15 - 0.0392, 0.0392), (80, 0.075, 0.075)):
+        final = settle(simulation, state, steps)
+        means = [float(final.velocity[layer == each, 0].mean()) for each in (1, 0)]
+        # Contact begins one step late, and the weight is passed on step by step: 2 of 20.
+        np.testing.assert_allclose(means, [top, bottom], atol=0.1 * 0.0392)
+
+
+@cache
+def crossing(angle: float) -> tuple[Simulation, np.ndarray]:
+    """A rope above another, square to it and turned by an angle; the largest speed allowed."""
+    one = rope(17, 0.2)
+    body = two_pieces(one, one)
+    time_step = 0.9 * largest_time_step(body)
+    top_speed = MOST_LAYERS_OF_ROPES * 2 * one.radius / time_step * 0.999
+    simulation = make_simulation(
+        body, time_step, gravity=0.0, self_contact=True, top_speed=top_speed
+    )
+    turned = goals.turn(one.rest, np.pi / 2 + angle)
+    return simulation, np.concatenate([one.rest, turned]) + np.array([0.0, 0.0, 1.0])
+
+
+def height_of_first_over_second(position: np.ndarray) -> float:
+    """Vertical distance of two ropes' middles where they cross as seen from above, or infinity."""
+    first, second = (each[4:13] for each in np.split(np.asarray(position, dtype=np.float64), 2))
+    for a, b in pairwise(first):
+        for c, d in pairwise(second):
+            matrix = np.stack([(b - a)[:2], (c - d)[:2]], axis=1)
+            if abs(np.linalg.det(matrix)) < 1e-12:
+                continue
+            s, t = np.linalg.solve(matrix, (c - a)[:2])
+            if 0 <= s <= 1 and 0 <= t <= 1:
+                return float((a + s * (b - a) - c - t * (d - c))[2])
+    return np.inf
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 1.0])
+def test_ropes_crossed_at_speed_do_not_pass_through_each_other(share):
+    rng = np.random.default_rng(0)
+    run = jax.jit(partial(settle, num_steps=3))
+    for _ in range(5):
+        simulation, position = crossing(float(rng.choice([-0.5, 0.0, 0.4])))
+        margin = float(simulation.self_contact.margin)
+        position = position.copy()
+        position[:17] += [*rng.uniform(-0.015, 0.015, 2), 0.015 + rng.uniform(0, margin)]
+        velocity = np.zeros_like(position)
+        velocity[:17, 2] = -share * margin / float(simulation.time_step)
+        state = State(*(jnp.asarray(each, jnp.float32) for each in (position, velocity)))
+        heights = []
+        # For 6 cm of the way: then the upper rope has wound itself around the lower one.
+        for _ in range(round(0.06 / (3 * share * margin))):
+            state = run(simulation, state)
+            heights.append(height_of_first_over_second(state.position))
+        assert min(heights) > 0.0
+        assert min(heights) < 0.01  # they have met
+
+
+def test_pickers_too_fast_for_the_thickness_are_refused():
+    body = cloth((5, 5), (0.05, 0.05))
+    # 1.1 of 4 mm in 1 ms.
+    make_simulation(body, 1e-3, self_contact=True, top_speed=4.39)
+    with pytest.raises(ValueError, match=r"4\.41 m/s; layers of 4 mm .* up to 4\.39"):
+        make_simulation(body, 1e-3, self_contact=True, top_speed=4.41)
+    with pytest.raises(ValueError, match="give a radius"):
+        make_self_contact(replace(body, radius=0.0), 1e-3)
+    with pytest.raises(ValueError, match="at least 1 time step"):
+        make_self_contact(body, 1e-3, interval=0)
+    with pytest.raises(ValueError, match="friction is -1"):
+        make_self_contact(body, 1e-3, friction=-1.0)
+    fast = replace(make_task("cloth_side_folding", quick=True), action_seconds=0.05)
+    with pytest.raises(ValueError, match="longer actions"):
+        fast.simulation(self_contact=True)
+
+
+def test_contacts_that_got_past_each_other_are_counted():
+    body, position, layer = stacked(2, 4e-3)
+    simulation = make_simulation(body, 1e-3, gravity=0.0, self_contact=True)
+    slow = np.where(layer == 1, -1.0, 0.0)[:, None] * [0, 0, 1.0]
+    position[layer == 1, 2] += 4e-3
+    state = State(jnp.asarray(position, jnp.float32), jnp.asarray(slow, jnp.float32))
+    assert int(settle(simulation, state, 20).missed) == 0
+    # 50 m/s: twelve thicknesses in a time step, where one is allowed.
+    assert int(settle(simulation, replace(state, velocity=50 * state.velocity), 3).missed) > 0
+
+
+FOLDS = {
+    "sides": (((0, 24), (600, 624)), ((600, 300), (624, 324))),
+    "corners": (((0, NONE), (624, NONE)), ((24, NONE), (600, NONE))),
+}
+"""Particles grasped, and those they are carried towards, in two folds of a cloth of 25 x 25."""
+
+
+def over(start: np.ndarray, end: np.ndarray, lift: float) -> np.ndarray:
+    """Displacements that carry something up, over and down, in four actions."""
+    up, down = (end - start) / 2 + [0, 0, lift], (end - start) / 2 - [0, 0, lift - 0.006]
+    return np.stack([up / 2, up / 2, down / 2, down / 2])
+
+
+@pytest.mark.slow
+def test_twice_folded_cloths_settle_with_no_particles_closer_than_their_thickness_allows():
+    body = cloth()
+    simulation = make_simulation(body, 0.9 * largest_time_step(body), self_contact=True)
+    pickers = make_pickers((0.2, 0.2, 0.2), steps=127)
+    run = jax.jit(lambda state, actions: rollout(simulation, pickers, state, actions)[0])
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        state = at_rest(goals.flat(body, rng.uniform(-np.pi / 4, np.pi / 4)))
+        share, lift = rng.uniform(0.8, 1.0), rng.uniform(0.06, 0.14)
+        for picks, targets in FOLDS[("sides", "corners")[seed % 2]]:
+            position = np.asarray(state.position)
+            moves = np.zeros((8, 2, 3))
+            for picker, (pick, target) in enumerate(zip(picks, targets, strict=True)):
+                end = position[pick] + share * (position[target] - position[pick])
+                moves[:4, picker] = 0 if pick == NONE else over(position[pick], end, lift)
+            grasped = np.tile(picks, (8, 1))
+            grasped[4:] = NONE
+            state = run(state, Actions(jnp.asarray(grasped), jnp.asarray(moves, jnp.float32)))
+        assert colliding_distances(simulation, state.position).min() > 0.8 * 2 * body.radius
+        assert np.ptp(state.position[:, 2]) > 3 * 2 * body.radius  # four layers
+
+
+# Transformations
+
+
+def colliding_rollout(simulation, pickers, state, displacement):
+    """The second of two ropes' ends, laid over the first."""
+    actions = Actions(jnp.asarray([[20, NONE]]), displacement[None])
+    return rollout(simulation, pickers, state, actions)[0]
+
+
+@cache
+def laid_over():
+    one = rope(9, 0.1)
+    body = two_pieces(one, one)
+    simulation = make_simulation(body, 1e-3, self_contact=True)
+    position = np.concatenate(
+        [one.rest, goals.turn(one.rest, 1.3) + np.array([0.003, 0.002, 0.0085])]
+    )
+    position[:, 2] += one.radius
+    displacement = np.zeros((2, 3))
+    displacement[0] = [0.01, 0.015, -0.004]
+    return simulation, make_pickers(steps=20), position, displacement
+
+
+@pytest.mark.usefixtures("x64")
+def test_gradients_through_contact_are_those_of_finite_differences():
+    laid_over.cache_clear()
+    simulation, pickers, position, displacement = laid_over()
+    laid_over.cache_clear()  # of float64
+    position = jnp.asarray(position)
+
+    def cost(height, displacement, friction):
+        contact = replace(simulation.self_contact, friction=friction)
+        changed = replace(simulation, self_contact=contact)
+        start = at_rest(position.at[9:, 2].add(height))
+        final = colliding_rollout(changed, pickers, start, displacement)
+        return jnp.sum(final.position[:, 0] ** 2) + jnp.sum(final.position[:9] * position[9:])
+
+    arguments = (jnp.asarray(0.0), jnp.asarray(displacement), jnp.asarray(0.02))
+    value = jax.jit(cost)
+    gradients = jax.jit(jax.grad(cost, (0, 1, 2)))(*arguments)
+    assert all(np.all(np.isfinite(each)) for each in gradients)
+    without = replace(simulation, self_contact=None)
+    free = colliding_rollout(without, pickers, at_rest(position), arguments[1])
+    held = colliding_rollout(simulation, pickers, at_rest(position), arguments[1])
+    assert np.abs(free.position - held.position).max() > 1e-4  # they touch
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        along = [rng.standard_normal(np.shape(each)) for each in arguments]
+        step = 1e-7
+        ahead, behind = (
+            value(*(a + sign * step * d for a, d in zip(arguments, along, strict=True)))
+            for sign in (1, -1)
+        )
+        expected = sum(np.vdot(g, d) for g, d in zip(gradients, along, strict=True))
+        # Rounding of the difference, 1e-16 / 1e-7, against gradients of order 1e-2.
+        np.testing.assert_allclose((ahead - behind) / (2 * step), expected, rtol=1e-5, atol=1e-8)
+
+
+def test_a_batch_is_its_samples_and_the_same_each_time():
+    simulation, pickers, position, displacement = laid_over()
+    state = at_rest(position)
+    several = jnp.asarray(np.stack([displacement, -displacement, 0.5 * displacement]), jnp.float32)
+    run = jax.jit(partial(colliding_rollout, simulation, pickers, state))
+    single = [run(each) for each in several]
+    batch = jax.jit(jax.vmap(partial(colliding_rollout, simulation, pickers, state)))(several)
+    for index, each in enumerate(single):
+        # 20 steps from the same floats in another order of operations.
+        np.testing.assert_allclose(batch.position[index], each.position, atol=1e-6)
+        again = run(several[index])
+        np.testing.assert_array_equal(again.position, each.position)
+        np.testing.assert_array_equal(again.missed, each.missed)
+
+
+def test_without_self_contact_nothing_of_it_is_compiled():
+    simulation, pickers, position, displacement = laid_over()
+    plain = replace(simulation, self_contact=None)
+    actions = jnp.asarray(displacement, jnp.float32)
+    run = partial(colliding_rollout, plain, pickers, at_rest(position))
+    lowered = jax.jit(run).lower(actions)
+    assert "stablehlo.sort" not in lowered.as_text()
+    assert jax.jit(run)(actions).missed is None
+
+
+def test_samples_that_touch_themselves_run_one_by_one():
+    body = rope(9, 0.1)
+    assert default_layout(64, make_simulation(body, 1e-3, self_contact=True)).chunk_size == 1
+    assert default_layout(64, make_simulation(body, 1e-3)).chunk_size > 1
