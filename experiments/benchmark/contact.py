@@ -24,14 +24,12 @@ from jaxsimp.dynamics import NONE, Actions, at_rest, largest_time_step, make_pic
 from jaxsimp.dynamics.simulation import make_simulation
 from jaxsimp.planning import Layout, PopulationMap
 
-SIDES = (25, 36, 50, 64)
-"""Particles along a side of a cloth of 0.3 m."""
 ACTION_SECONDS = 0.25
 
 
 def self_contact(scale: Scale) -> Iterator[Row]:
     """A cloth folded over and settling, with and without self-contact, in turns."""
-    sides = SIDES if len(scale.growth) > 2 else SIDES[:2]
+    sides = scale.contact_sides
     ready = {
         (side, touches): prepare(partial(_fold, side, touches))
         for side in sides
@@ -39,10 +37,9 @@ def self_contact(scale: Scale) -> Iterator[Row]:
     }
     times = time_in_turns([each.run for each in ready.values()], scale.repeats)
     seconds = dict(zip(ready, times.T, strict=True))
-    exponent = fit_exponent(
-        [side**2 for side in sides],
-        [float(np.median(seconds[side, True])) / _num_steps(side) for side in sides],
-    )
+    each_step = [float(np.median(seconds[side, True])) / _num_steps(side) for side in sides]
+    particles = [side**2 for side in sides]
+    exponent = fit_exponent(particles, each_step) if len(sides) > 1 else None
     for (side, touches), prepared in ready.items():
         yield _row(side, touches, prepared, seconds) | {"exponent": exponent if touches else None}
 

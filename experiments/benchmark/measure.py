@@ -47,6 +47,7 @@ class Scale:
         sides: of the cloths of the first sweep.
         populations: of the second.
         horizons: actions of the rollouts of the third.
+        contact_sides: of the cloths that touch themselves.
         cem_side: particles along a side of the cloth that is planned for.
         cem_iterations: of a plan.
         cem_plans: plans made.
@@ -66,6 +67,7 @@ class Scale:
     sides: tuple[int, ...]
     populations: tuple[int, ...]
     horizons: tuple[int, ...]
+    contact_sides: tuple[int, ...]
     cem_side: int
     cem_iterations: int
     cem_plans: int
@@ -86,6 +88,7 @@ FULL = Scale(
     sides=(16, 25, 32, 50, 64, 100),
     populations=(16, 64, 256, 1024),
     horizons=(2, 4, 8, 16, 32),
+    contact_sides=(25, 36, 50, 64),
     cem_side=25,
     cem_iterations=15,
     cem_plans=3,
@@ -105,6 +108,7 @@ QUICK = Scale(
     sides=(25, 50),
     populations=(16, 64),
     horizons=(2, 16),
+    contact_sides=(25,),
     cem_side=15,
     cem_iterations=4,
     cem_plans=1,

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsimp import goals
 from jaxsimp.dynamics import NONE, Actions, State
 from jaxsimp.planning import ENCODINGS, CEMConfig, Engine, Layout, MassSprings, Planner
 from jaxsimp.tasks import make_task
@@ -52,6 +53,39 @@ def test_the_engine_carries_out_the_plan():
     np.testing.assert_allclose(done.positions[:3], expected, atol=1e-7)
     np.testing.assert_allclose(done.positions[3], expected[2], atol=1e-7)
     assert done.score == pytest.approx(0.5, abs=1e-5)  # half the way
+
+
+def test_a_plan_is_executed_by_the_judge():
+    episode, planner = glided(1.0)
+    judged = Planner(planner.task, CONFIG, Layout(4, 1), Gliding(1.0), judge=Gliding(0.5))
+    moves = jnp.full((2, 2, 3), jnp.array([0.05, 0.0, 0.0]))
+    actions = Actions(jnp.full((2, 2), NONE), moves)
+    assert planner.execute(episode, actions).score == pytest.approx(1.0, abs=1e-5)
+    assert judged.execute(episode, actions).score == pytest.approx(0.5, abs=1e-5)
+    batch = Actions(actions.pick[None], actions.displacement[None])
+    np.testing.assert_array_equal(judged.costs(episode, batch), planner.costs(episode, batch))
+
+
+@pytest.mark.slow
+def test_a_plan_can_be_executed_with_self_contact():
+    task = make_task("cloth_side_folding", 9)
+    planner = Planner(
+        task, CEMConfig(num_iterations=1, population=8), judge=MassSprings(self_contact=True)
+    )
+    # One side laid on the other: two corners carried over.
+    moves = np.array([[[0.0, 0.15, 0.1]] * 2, [[0.0, 0.15, -0.1]] * 2])
+    carried = Actions(jnp.array([[0, 72]] * 2), jnp.asarray(moves, dtype=float))
+    episode = task.episode_fn(0)
+    episode = dataclasses.replace(episode, start=goals.flat(task.body))
+    done = planner.execute(episode, carried)
+    assert isinstance(done.missed, int)
+    assert np.isfinite(done.positions).all()
+    plain = Planner(task, CEMConfig(num_iterations=1, population=8)).execute(episode, carried)
+    assert plain.missed is None
+    # Without it the corners come to lie on the table, with it on what lies there.
+    above = [each.positions[-1][[0, 72], 2] - task.body.radius for each in (plain, done)]
+    assert np.abs(above[0]).max() < 1e-4
+    assert above[1].min() > 0.8 * 2 * task.body.radius
 
 
 def test_a_plan_is_searched_with_the_engine():
