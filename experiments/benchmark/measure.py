@@ -37,6 +37,7 @@ class Scale:
 
     Attributes:
         repeats: of which the median is reported.
+        kinds: of bodies that rollouts and layouts are measured on.
         rope: particles along the rope.
         side: particles along a side of the cloths.
         population: rollouts at a time.
@@ -57,6 +58,7 @@ class Scale:
     """
 
     repeats: int
+    kinds: tuple[str, ...]
     rope: int
     side: int
     population: int
@@ -78,6 +80,7 @@ class Scale:
 
 FULL = Scale(
     repeats=5,
+    kinds=("rope", "cloth", "unstructured"),
     rope=41,
     side=25,
     population=128,
@@ -98,6 +101,7 @@ FULL = Scale(
 )
 QUICK = Scale(
     repeats=3,
+    kinds=("rope", "cloth"),
     rope=41,
     side=25,
     population=32,

@@ -32,7 +32,6 @@ from experiments.engines.workload import (
 from jaxsimp.dynamics import Actions, at_rest, settle
 from jaxsimp.planning import Layout, PopulationMap, default_layout
 
-KINDS = ("rope", "cloth", "unstructured")
 SWEPT_POPULATION, SWEPT_HORIZON = 64, 2
 """Where the sweeps of `scaling` meet: such that all of them are done in minutes."""
 SINGLE = Layout(chunk_size=1, num_workers=1)
@@ -62,7 +61,7 @@ def rollout(scale: Scale) -> Iterator[Row]:
 def _one_sample(
     name: str, scale: Scale, make: Callable[[Workload], Callable[[], Any]]
 ) -> Iterator[Row]:
-    sides = {kind: scale.rope if kind == "rope" else scale.side for kind in KINDS}
+    sides = {kind: scale.rope if kind == "rope" else scale.side for kind in scale.kinds}
     workloads = [
         make_workload(make_body(kind, side), 1, scale.num_actions, scale.action_steps)
         for kind, side in sides.items()
@@ -81,7 +80,7 @@ def _one_sample(
 
 def population(scale: Scale) -> Iterator[Row]:
     """A population of each kind of body in every layout; errors: differences from the default."""
-    for kind in KINDS:
+    for kind in scale.kinds:
         side = scale.rope if kind == "rope" else scale.side
         yield from _layouts(kind, side, scale)
 

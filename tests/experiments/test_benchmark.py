@@ -27,6 +27,7 @@ from experiments.engines.workload import UnavailableError
 TINY = dataclasses.replace(
     QUICK,
     repeats=2,
+    kinds=("rope",),
     rope=9,
     side=5,
     population=4,
@@ -70,7 +71,6 @@ def without_peers():
     with pytest.MonkeyPatch.context() as patch:
         patch.delitem(ENGINES, "taichi")
         patch.delitem(ENGINES, "warp")
-        patch.setattr(rollouts, "KINDS", ("rope",))
         yield
 
 
