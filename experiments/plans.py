@@ -246,9 +246,9 @@ def _run(
         "seed": seed,
         "num_particles": task.body.num_particles,
         "num_key_points": len(model),
-        "cost_per_iteration": [_finite(cost) for cost in found.best_costs],
-        "elite_cost_per_iteration": [_finite(cost) for cost in found.elite_costs],
-        "final_cost": _finite(found.cost),
+        "cost_per_iteration": [finite(cost) for cost in found.best_costs],
+        "elite_cost_per_iteration": [finite(cost) for cost in found.elite_costs],
+        "final_cost": finite(found.cost),
         "final_score": score,
         "rollouts": found.num_rollouts,
         "non_finite": found.non_finite,
@@ -273,7 +273,7 @@ def _row_config(planner: Planner) -> dict[str, Any]:
     }
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
     """JSON has no infinity: a cost that no rollout gave is null."""
     return value if np.isfinite(value) else None
 

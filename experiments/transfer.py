@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -146,7 +145,7 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
             "seed": seed,
             "action_space": SCRIPTED,
             "pick_encoding": None,
-            "final_score": _finite(value),
+            "final_score": plans.finite(value),
             "plan": f"{plans.PLANS_FOLDER}/{path.name}",
         }
         cases.append(Case(row, path))
@@ -197,7 +196,7 @@ def _replay_chunk(task: Task, cases: list[Case], folder: Path) -> list[dict[str,
 def _fields(replays: dict[str, Replay]) -> dict[str, Any]:
     """What replays add to a row."""
     warnings = [f"{name}: {each}" for name, one in replays.items() for each in one.warnings]
-    scores = {f"mujoco_{name}_score": _finite(one.score) for name, one in replays.items()}
+    scores = {f"mujoco_{name}_score": plans.finite(one.score) for name, one in replays.items()}
     status = {f"mujoco_{name}_status": one.status.name for name, one in replays.items()}
     return scores | status | {"warnings": warnings}
 
@@ -209,11 +208,6 @@ def _save(folder: Path, case: Case, variant: str, actions: Actions, result: Repl
 def replay_path(folder: Path, row: dict[str, Any], variant: str) -> Path:
     """Where the motion of a replay is."""
     return folder / REPLAYS_FOLDER / f"{Path(row['plan']).stem}-{variant}.npz"
-
-
-def _finite(value: float) -> float | None:
-    """JSON has no numbers that are none: null."""
-    return value if np.isfinite(value) else None
 
 
 def _key(row: dict[str, Any]) -> tuple[Any, ...]:

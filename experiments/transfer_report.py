@@ -95,7 +95,7 @@ def _report(study: Study, summary: dict[str, Any], pictures: list[str]) -> str:
         "",
         f"A plan transfers when its settled score is at least {study.success_score}. Score 1 is "
         f"the goal, 0 the start. {study.plans.seeds} seeds a row; intervals are 95 % (Wilson). "
-        "Fast: no stretching, limp, layers pass through each other. Full: elastic as our springs "
+        "Fast: hardly stretches, limp, layers pass through others. Full: elastic as our springs "
         "are, with self-collision and friction between layers.",
         "",
         "## Plans that were found",

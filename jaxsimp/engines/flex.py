@@ -10,8 +10,8 @@ states. What corresponds and how:
   with its square. Their energies are made equal at a turn of one radian (see
   `bending_rigidity`).
 
-The "full" variant has all that, and collides with itself. The "fast" one does not stretch (its
-edges are constraints), is limp, and passes through itself. MuJoCo is imported when called.
+The "full" variant has all that, and collides with itself. The "fast" one hardly stretches (its
+edges are soft constraints), is limp, and passes through itself. MuJoCo is imported when called.
 """
 
 from collections.abc import Iterable

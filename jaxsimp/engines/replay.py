@@ -6,7 +6,6 @@ along the displacement. Plans run side by side on all cores, each in its own `mu
 plan's result does not depend on the others.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsimp.dynamics import NONE, Actions, Pickers, make_pickers
 from jaxsimp.dynamics.pickers import grasp, speed_profile
 from jaxsimp.engines.flex import Variant, make_model
+from jaxsimp.planning.population import num_cores
 from jaxsimp.tasks import Episode, Task, score
 
 LEAD = 4
@@ -91,7 +91,7 @@ def replay(
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
     model = make_model(task.body, variant, picked)
     score_fn = jax.jit(partial(score, task))
-    with ThreadPoolExecutor(num_workers or _num_cores()) as pool:
+    with ThreadPoolExecutor(num_workers or num_cores()) as pool:
         return list(pool.map(partial(_replay_one, task, model, score_fn), episodes, plans))
 
 
@@ -116,11 +116,6 @@ def _replay_one(
     status = ReplayStatus.UNSTABLE if unstable else ReplayStatus(bool(warnings))
     value = float("nan") if unstable else float(score_fn(episode, jnp.asarray(frames[-1])))
     return Replay(np.stack(frames), value, status, warnings)
-
-
-def _num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Scene:

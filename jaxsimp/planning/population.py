@@ -71,11 +71,11 @@ def default_layout(population: int, simulation: Simulation) -> Layout:
     alone = large or simulation.self_contact is not None
     return Layout(
         chunk_size=1 if alone else min(CHUNK_SIZE, population),
-        num_workers=max(_num_cores(), len(devices)),
+        num_workers=max(num_cores(), len(devices)),
     )
 
 
-def _num_cores() -> int:
+def num_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
