@@ -2,9 +2,9 @@
 
 A particle of a sheet stands for a disc in the sheet's plane, one of a rope for a piece of its
 line. Each touches at most one other on either side: the nearest that is not its neighbour in the
-body (see nearest.py). A contact keeps the direction that it was found with, from one particle to
-the other and square to both sheets or lines, until all are looked up again. That is when one has
-moved farther than its distance from what it does not touch allows.
+body. A contact keeps the direction that it was found with, from one particle to the other and
+square to both sheets or lines, until all are looked up again. That is when one has moved farther
+than its distance from what it does not touch allows.
 
 Contact acts every `interval` time steps on velocities, as impulses that are inelastic and look
 ahead (nobody approaches faster than would close the gap within the interval), with Coulomb
@@ -12,25 +12,32 @@ friction, and on positions, where particles are closer than the thickness. Parti
 contacts share their mass out among them (mass splitting: Tonge, Benevolenski and Voroshilov,
 "Mass Splitting for Jitter-Free Parallel Rigid Body Simulation", 2012), so that one pass in
 parallel does not overshoot.
+
+Values are those of contact_kernels.py, compiled by numba, on the CPU only. Derivatives are those
+of `resolve` and `directions`, the same in JAX, at these values.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import PyTreeDef
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsimp.dynamics.layers import SelfContact
-from jaxsimp.dynamics.nearest import nearest_above
 
 LEVEL = 0.3
 """Layers closer than this, of the thickness, count as side by side."""
+Padded = Float[Array, "3 NHH"]
+"""Something of every particle, with the halo of springs.py on either side."""
 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["partner", "direction", "listed", "found_at", "allowance", "carried", "missed"],
+    data_fields=["partner", "direction", "found_at", "allowance", "carried", "missed"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -38,9 +45,8 @@ class Contacts:
     """Who may touch whom.
 
     Attributes:
-        partner: particle ids, one on either side, shape (2, N).
+        partner: particle ids, one on either side, a particle's own for none, shape (2, N).
         direction: of unit length, from the partner, shape (3, 2, N).
-        listed: whether there is a partner, shape (2, N).
         found_at: positions when they were looked up, shape (3, N), metres.
         allowance: how far each may move from there, shape (N,), metres.
         carried: 1 for a particle that lies on the table or on one that is carried, shape (N,).
@@ -49,83 +55,40 @@ class Contacts:
 
     partner: Int[Array, "2 N"]
     direction: Float[Array, "3 2 N"]
-    listed: Bool[Array, "2 N"]
     found_at: Float[Array, "3 N"]
     allowance: Float[Array, " N"]
     carried: Float[Array, " N"]
     missed: Int[Array, ""]
 
 
-def find_contacts(
-    settings: SelfContact,
-    position: Float[Array, "3 N"],
-    carried: Float[Array, " N"],
-    missed: Int[Array, ""],
-) -> Contacts:
-    """Look up who may touch whom. Ids count as constants in derivatives, directions do not."""
-    still = jax.lax.stop_gradient
-    across = _across(settings, position)
-    stretch = jnp.sqrt(1 + settings.squash)
-    touching = jnp.hypot(settings.lateral, stretch * settings.thickness)
-    reach = jnp.hypot(settings.lateral, stretch * (settings.thickness + settings.margin))
-
-    # The sides of a sheet; around a rope there is room for more: it is above and below.
-    upwards = jnp.zeros_like(position).at[2].set(1.0)
-    normal = still(across) if settings.is_sheet else upwards
-
-    def look(normal: Float[Array, "3 N"]) -> tuple[Array, Array]:
-        return nearest_above(
-            still(position),
-            normal,
-            settings.apart,
-            adjacent=settings.adjacent,
-            squash=settings.squash,
-            level=LEVEL * settings.thickness,
-            reach=reach,
-        )
-
-    found = look(normal), look(-normal)
-    partner, distance = (jnp.stack(each) for each in zip(*found, strict=True))
-    away = position[:, None] - position[:, partner]
-    direct = _directions_of_sheets if settings.is_sheet else _directions_of_lines
-    mine = jnp.broadcast_to(across[:, None], away.shape)
-    direction = direct(settings.thickness, away, mine, across[:, partner])
-    free = (distance.min(axis=0) - touching) / (2.0 * stretch)
-    return Contacts(
-        partner=partner,
-        direction=direction,
-        listed=partner != jnp.arange(position.shape[1])[None],
-        found_at=still(position),
-        allowance=jnp.maximum(settings.slack, free),
-        carried=carried,
-        missed=missed,
+def find_contacts(settings: SelfContact, position: Padded, missed: Int[Array, ""]) -> Contacts:
+    """Look up who may touch whom, with so many contacts missed before."""
+    count, real = settings.apart.shape[1], position.dtype
+    nobody = Contacts(
+        partner=jnp.tile(jnp.arange(count, dtype=jnp.int32), (2, 1)),
+        direction=jnp.zeros((3, 2, count), real),
+        found_at=jnp.zeros((3, count), real),
+        allowance=jnp.full(count, -1.0, real),
+        carried=jnp.zeros(count, real),
+        missed=missed.astype(jnp.int32),
     )
+    nothing, zero = jnp.zeros(count, real), jnp.zeros((), real)
+    still = jnp.zeros_like(position)
+    return touch(settings, nobody, nothing, zero, zero, position, still, passes=0)[0]
 
 
-def renew(
-    settings: SelfContact,
-    contacts: Contacts,
-    position: Float[Array, "3 N"],
-) -> Contacts:
-    """The contacts, looked up again if a particle has gone too far."""
-    moved = jax.lax.stop_gradient(position - contacts.found_at)
-    return jax.lax.cond(
-        (_dot(moved, moved) > contacts.allowance**2).any(),
-        lambda: find_contacts(settings, position, contacts.carried, contacts.missed),
-        lambda: contacts,
-    )
-
-
-def resolve(
+def touch(
     settings: SelfContact,
     contacts: Contacts,
     inverse_mass: Float[Array, " N"],
     floor: Float[Array, ""],
     seconds: Float[Array, ""],
-    position: Float[Array, "3 N"],
-    velocity: Float[Array, "3 N"],
-) -> tuple[Contacts, Float[Array, "3 N"], Float[Array, "3 N"]]:
-    """Positions and velocities after contact, and the contacts with the count of those missed.
+    position: Padded,
+    velocity: Padded,
+    *,
+    passes: int,
+) -> tuple[Contacts, Padded, Padded]:
+    """Positions and velocities after contact, and contacts that are good until it acts again.
 
     Args:
         settings: of the body.
@@ -135,16 +98,122 @@ def resolve(
         seconds: until contact acts again.
         position: metres.
         velocity: metres per second.
+        passes: over all contacts.
     """
+    arguments = (settings, contacts, inverse_mass, floor, seconds, position, velocity)
+    leaves, tree = jax.tree.flatten(arguments)
+    position, velocity, *of_contacts = _touch(tree, passes, leaves)[:-1]
+    return Contacts(*of_contacts), position, velocity
+
+
+# Of leaves: JAX makes trees of things that are no arrays here.
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
+    """Position, velocity, fields of the contacts, and whether they were looked up again."""
+    from jaxsimp.dynamics.contact_kernels import touch_target  # numba takes a while to import
+
+    settings, contacts, inverse_mass, floor, seconds, position, velocity = jax.tree.unflatten(
+        tree, leaves
+    )
+    real, stretch = position.dtype, jnp.sqrt(1 + settings.squash)
+    near = stretch * settings.thickness
+    numbers = [
+        settings.adjacent,
+        settings.thickness,
+        settings.lateral,
+        settings.slack,
+        settings.squash,
+        settings.friction,
+        floor,
+        seconds,
+        LEVEL * settings.thickness,
+        jnp.hypot(settings.lateral, near),
+        jnp.hypot(settings.lateral, near + stretch * settings.margin),
+    ]
+    changing = [
+        position,
+        velocity,
+        contacts.partner,
+        contacts.direction,
+        contacts.found_at,
+        contacts.allowance,
+        contacts.carried,
+        contacts.missed,
+    ]
+    kinds = [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in changing]
+    call = jax.ffi.ffi_call(
+        touch_target(np.dtype(real)),
+        (*kinds, jax.ShapeDtypeStruct((), np.dtype(bool))),
+        vmap_method="sequential",
+        input_output_aliases={place: place for place in range(len(changing))},
+    )
+    constant = (
+        inverse_mass,
+        jnp.stack(numbers).astype(real),
+        settings.frame.astype(jnp.int32),
+        settings.apart,
+        jnp.asarray(settings.is_sheet),
+        jnp.asarray(passes, jnp.int32),
+    )
+    return list(call(*changing, *constant))
+
+
+@_touch.defjvp
+def _touch_jvp(
+    tree: PyTreeDef, passes: int, primals: tuple[list[Array]], tangents: tuple[list[Any]]
+) -> tuple[list[Array], list[Any]]:
+    """Ids, and whether contacts are looked up, count as constants."""
+    result = _touch(tree, passes, *primals)
+    partner, renewed = result[2], result[-1]
+
+    def smooth(leaves: list[Array]) -> tuple[Array, Array, Array]:
+        settings, contacts, inverse_mass, floor, seconds, *moving = jax.tree.unflatten(
+            tree, leaves
+        )
+        count = len(inverse_mass)
+        halo = (moving[0].shape[1] - count) // 2
+        position, velocity = (array[:, halo : halo + count] for array in moving)
+        carried = contacts.carried
+        for _ in range(passes):
+            carried, position, velocity = resolve(
+                settings, contacts, carried, inverse_mass, floor, seconds, position, velocity
+            )
+        anew = directions(settings, partner, position)
+        direction = jnp.where(renewed, anew, contacts.direction)
+        ends = ((0, 0), (halo, halo))
+        return jnp.pad(position, ends), jnp.pad(velocity, ends), direction
+
+    _, (by_position, by_velocity, by_direction) = jax.jvp(smooth, primals, tangents)
+    nothing = [
+        jnp.zeros_like(each)
+        if jnp.issubdtype(each.dtype, jnp.floating)
+        else np.zeros(each.shape, jax.dtypes.float0)
+        for each in result
+    ]
+    return result, [by_position, by_velocity, nothing[2], by_direction, *nothing[4:]]
+
+
+def resolve(
+    settings: SelfContact,
+    contacts: Contacts,
+    carried: Float[Array, " N"],
+    inverse_mass: Float[Array, " N"],
+    floor: Float[Array, ""],
+    seconds: Float[Array, ""],
+    position: Float[Array, "3 N"],
+    velocity: Float[Array, "3 N"],
+) -> tuple[Float[Array, " N"], Float[Array, "3 N"], Float[Array, "3 N"]]:
+    """What is carried, positions and velocities after one pass over all contacts."""
     partner, along = contacts.partner, contacts.direction
-    rows = jnp.concatenate([position, velocity, inverse_mass[None], contacts.carried[None]])
+    listed = partner != jnp.arange(position.shape[1])[None]
+    rows = jnp.concatenate([position, velocity, inverse_mass[None], carried[None]])
     theirs = rows[:, partner]
     away, speed = rows[:3, None] - theirs[:3], rows[3:6, None] - theirs[3:6]
     distance, approach = _dot(along, away), _dot(along, speed)
     beside = _dot(away, away) - distance * distance
     gap = distance - settings.thickness
     lacking = -jnp.maximum(gap, 0.0) / seconds - approach
-    near = contacts.listed & (beside < settings.lateral**2)
+    near = listed & (beside < settings.lateral**2)
     touches = near & ((gap < 0.0) | (lacking > 0.0))
     # What is carried does not give way to what lies on it: the push would be lost in the table.
     below, above = along[2] < -0.5, along[2] > 0.5
@@ -167,12 +236,27 @@ def resolve(
     pushed = position + total[:3]
     pushed = pushed.at[2].max(jnp.minimum(position[2], floor))
     lies = near & (gap < LEVEL * settings.thickness)
-    carried = jnp.where(lies & above, theirs[7], 0.0).max(axis=0, initial=0.0)
-    carried = carried.at[partner].max(jnp.where(lies & below, rows[7, None], 0.0))
-    carried = jnp.maximum(carried, position[2] < floor + 0.1 * settings.thickness)
-    missed = contacts.missed + (near & (distance < 0.0)).sum()
-    contacts = replace(contacts, missed=missed, carried=jax.lax.stop_gradient(carried))
-    return contacts, pushed, velocity + total[3:]
+    lying = jnp.where(lies & above, theirs[7], 0.0).max(axis=0, initial=0.0)
+    lying = lying.at[partner].max(jnp.where(lies & below, rows[7, None], 0.0))
+    on_table = position[2] < floor + 0.1 * settings.thickness
+    carried = jnp.where(on_table, 1.0, jax.lax.stop_gradient(lying))
+    return carried, pushed, velocity + total[3:]
+
+
+def directions(
+    settings: SelfContact, partner: Int[Array, "2 N"], position: Float[Array, "3 N"]
+) -> Float[Array, "3 2 N"]:
+    """Unit vectors from partners, square to both sheets or lines; up where there is no partner."""
+    across = _across(settings, position)
+    away = position[:, None] - position[:, partner]
+    direct = _directions_of_sheets if settings.is_sheet else _directions_of_lines
+    mine = jnp.broadcast_to(across[:, None], away.shape)
+    direction = direct(settings.thickness, away, mine, across[:, partner])
+    listed = partner != jnp.arange(position.shape[1])[None]
+    upwards = jnp.zeros_like(direction).at[2].set(1.0)
+    return jnp.where(listed[None], direction, upwards)
+
+
 
 
 def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array, "3 N"]:

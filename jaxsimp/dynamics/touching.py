@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsimp.dynamics.self_contact import Contacts, find_contacts, renew, resolve
+from jaxsimp.dynamics.self_contact import Contacts, find_contacts, touch
 from jaxsimp.dynamics.simulation import Simulation, State
 from jaxsimp.dynamics.step import Motion, Packed, pack, unpack
 
@@ -21,13 +21,11 @@ Moving = tuple[Packed, Contacts | None]
 
 def begin(simulation: Simulation, state: State) -> Moving:
     """A state made ready to be stepped."""
-    settings, contacts = simulation.self_contact, None
-    if settings is not None:
-        missed = jnp.zeros((), dtype=int) if state.missed is None else state.missed
-        contacts = find_contacts(
-            settings, state.position.T, jnp.zeros_like(simulation.mass), missed
-        )
-    return pack(simulation, state), contacts
+    packed, settings = pack(simulation, state), simulation.self_contact
+    if settings is None:
+        return packed, None
+    missed = jnp.zeros((), jnp.int32) if state.missed is None else state.missed
+    return packed, find_contacts(settings, packed[0], missed)
 
 
 def end(simulation: Simulation, moving: Moving) -> State:
@@ -67,14 +65,9 @@ def _touch(
     settings = simulation.self_contact
     assert settings is not None
     assert contacts is not None
-    halo, count = simulation.springs.halo, len(simulation.mass)
-    position, velocity = (array[:, halo : halo + count] for array in packed)
     seconds = settings.interval * simulation.time_step
     inverse_mass = jnp.where(motion.held, 0.0, 1.0 / simulation.mass)
-    for _ in range(PASSES):
-        contacts, position, velocity = resolve(
-            settings, contacts, inverse_mass, simulation.radius, seconds, position, velocity
-        )
-    contacts = renew(settings, contacts, position)
-    padding = ((0, 0), (halo, halo))
-    return (jnp.pad(position, padding), jnp.pad(velocity, padding)), contacts
+    contacts, *touched = touch(
+        settings, contacts, inverse_mass, simulation.radius, seconds, *packed, passes=PASSES
+    )
+    return tuple(touched), contacts

@@ -24,8 +24,7 @@ from jaxsimp.dynamics import (
     settle,
 )
 from jaxsimp.dynamics.layers import MOST_LAYERS_OF_ROPES, SPARE, make_self_contact
-from jaxsimp.dynamics.nearest import nearest_above
-from jaxsimp.dynamics.self_contact import find_contacts, resolve
+from jaxsimp.dynamics.self_contact import _across, directions, find_contacts, resolve, touch
 from jaxsimp.planning import default_layout
 from jaxsimp.tasks import make_task
 
@@ -65,51 +64,95 @@ def colliding_distances(simulation: Simulation, position: np.ndarray) -> np.ndar
 # Who is near
 
 
-@pytest.mark.parametrize("count", [2, 37, 300])
-def test_nearest_is_that_of_all_pairs(count):
-    rng = np.random.default_rng(count)
-    position, apart = rng.uniform(-0.1, 0.1, (2, 3, count))
-    normal = rng.standard_normal((3, count))
-    normal /= np.linalg.norm(normal, axis=0)
-    adjacent, squash, level, reach = 0.05, 1.5, 0.002, 0.06
-    ids, distance = nearest_above(
-        *(jnp.asarray(each, jnp.float32) for each in (position, normal)),
-        jnp.asarray(apart, jnp.float32),
-        adjacent=jnp.float32(adjacent),
-        squash=jnp.float32(squash),
-        level=jnp.float32(level),
-        reach=jnp.float32(reach),
-    )
-    away = position[:, None] - position[:, :, None]
+def crumpled(body: Body, seed: int, size: float) -> np.ndarray:
+    """Particles of a body anywhere in a box, shape (3, N)."""
+    return np.random.default_rng(seed).uniform(0, size, (3, body.num_particles)).astype(np.float32)
+
+
+@pytest.mark.parametrize("body", [cloth((5, 5), (0.05, 0.05)), cloth((15, 15)), rope(60, 0.3)])
+@pytest.mark.parametrize("size", [0.02, 0.1])
+def test_partners_are_the_nearest_of_all_pairs(body, size):
+    settings = make_self_contact(body, 1e-3)
+    position = crumpled(body, 0, size)
+    contacts = find_contacts(settings, jnp.asarray(position), jnp.zeros((), jnp.int32))
+    count, squash = body.num_particles, float(settings.squash)
+    normal = np.asarray(_across(settings, jnp.asarray(position)))
+    if not settings.is_sheet:
+        normal = np.tile([[0.0], [0.0], [1.0]], count)
+    away = (position[:, None] - position[:, :, None]).astype(np.float64)
     above = (normal[:, :, None] * away).sum(axis=0)
     true = np.sqrt((away**2).sum(axis=0) + squash * above**2)
-    true[np.linalg.norm(apart[:, None] - apart[:, :, None], axis=0) < adjacent] = np.inf
-    np.fill_diagonal(true, np.inf)
-    true[above < -level] = np.inf
-    best = true.min(axis=1)
-    found = np.asarray(ids) != np.arange(count)
-    # Squares are told apart to N / 2^24 of the reach's: 5e-6 m^2 / 3600 here.
-    resolution = reach * np.sqrt(count / 2**24) + 1e-6
-    np.testing.assert_array_equal(found, best <= reach)
-    of_found = true[np.arange(count), ids][found]
-    assert np.all(np.abs(of_found - best[found]) < resolution)
-    assert np.all(np.abs(distance - np.minimum(best, reach)) < resolution)
-
-
-def test_nearest_above_finds_everybody_when_all_stand_in_one_column():
-    # Nothing is pruned: the widest axis has no width.
-    count = 50
-    ids, distance = nearest_above(
-        jnp.zeros((3, count)),
-        jnp.zeros((3, count)).at[2].set(1.0),
-        jnp.arange(3.0 * count).reshape(3, count),
-        adjacent=jnp.float32(0.5),
-        squash=jnp.float32(0.0),
-        level=jnp.float32(0.0),
-        reach=jnp.float32(0.01),
+    apart = np.asarray(settings.apart)
+    rest = np.linalg.norm(apart[:, None] - apart[:, :, None], axis=0)
+    true[rest < float(settings.adjacent)] = np.inf
+    thickness = float(settings.thickness)
+    reach = np.hypot(
+        float(settings.lateral),
+        np.sqrt(1 + squash) * (thickness + float(settings.margin)),
     )
-    assert np.all(np.asarray(ids) != np.arange(count))
-    assert np.all(np.asarray(distance) == 0)
+    nearest = []
+    for side, partner in zip((1, -1), np.asarray(contacts.partner), strict=True):
+        distances = np.where(side * above < -0.3 * thickness, np.inf, true)
+        best = distances.min(axis=1)
+        found = partner != np.arange(count)
+        # Rounding of float32, of numbers up to 0.1, may decide who is just within reach.
+        np.testing.assert_array_equal(found[abs(best - reach) > 1e-6], (best < reach)[abs(best - reach) > 1e-6])
+        assert np.all(distances[np.arange(count), partner][found] < best[found] + 1e-6)
+        nearest.append(np.minimum(best, reach))
+    touching = np.hypot(float(settings.lateral), np.sqrt(1 + squash) * thickness)
+    free = (np.min(nearest, axis=0) - touching) / (2 * np.sqrt(1 + squash))
+    np.testing.assert_allclose(
+        contacts.allowance, np.maximum(free, float(settings.slack)), atol=1e-6
+    )
+    expected = directions(settings, contacts.partner, jnp.asarray(position))
+    # Where a direction is decided by the sign or size of something close to a threshold.
+    differs = np.abs(expected - contacts.direction).max(axis=0) > 1e-4
+    assert differs.mean() < 0.01
+
+
+@pytest.mark.parametrize("body", [cloth((9, 9), (0.1, 0.1)), rope(60, 0.3)])
+def test_what_has_flown_apart_or_is_not_a_number_is_looked_up_all_the_same(body):
+    settings = make_self_contact(body, 1e-3)
+    position = crumpled(body, 1, 0.02)
+    before = find_contacts(settings, jnp.asarray(position), jnp.zeros((), jnp.int32))
+    listed = np.asarray(before.partner) != np.arange(body.num_particles)
+    assert listed.any()
+    for value in (1e6, np.nan, np.inf):
+        bad = position.copy()
+        bad[:, 3] = value
+        after = find_contacts(settings, jnp.asarray(bad), jnp.zeros((), jnp.int32))
+        others = np.delete(listed & (np.asarray(before.partner) != 3), 3, axis=1)
+        same = np.delete(np.asarray(after.partner == before.partner), 3, axis=1)
+        if np.isfinite(value):
+            assert same[others].mean() > 0.9
+        assert np.all(np.asarray(after.partner)[:, 3] == 3)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("body", [cloth((9, 9), (0.1, 0.1)), rope(60, 0.3)])
+@pytest.mark.parametrize("seed", range(5))
+def test_impulses_and_pushes_are_those_that_jax_differentiates(body, seed):
+    settings = make_self_contact(body, 1e-3)
+    rng = np.random.default_rng(seed)
+    position = jnp.asarray(crumpled(body, seed, 0.03), float)
+    velocity = jnp.asarray(rng.uniform(-1, 1, position.shape))
+    inverse = jnp.asarray(rng.uniform(0, 2, body.num_particles) * (rng.random(body.num_particles) > 0.1))
+    contacts = find_contacts(settings, position, jnp.zeros((), jnp.int32))
+    contacts = replace(contacts, carried=jnp.asarray(rng.integers(0, 2, body.num_particles), float))
+    floor, seconds = jnp.asarray(0.01), jnp.asarray(1e-3)
+    after, *found = touch(
+        settings, contacts, inverse, floor, seconds, position, velocity, passes=2
+    )
+    carried, *expected = contacts.carried, position, velocity
+    for _ in range(2):
+        carried, *expected = resolve(
+            settings, contacts, carried, inverse, floor, seconds, *expected
+        )
+    assert np.abs(np.asarray(expected[0] - position)).max() > 1e-4
+    # Sums in another order, of float64.
+    np.testing.assert_allclose(found[0], expected[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(after.carried, carried)
 
 
 # Two particles: closed forms
@@ -128,8 +171,8 @@ def pair(gap: float, speed: float, *, sideways: float = 0.0, masses=(1.0, 3.0), 
     if held:
         inverse[:3] = 0
     position, velocity = jnp.asarray(position.T), jnp.asarray(velocity.T)
-    contacts = find_contacts(settings, position, jnp.zeros(6), jnp.zeros((), int))
-    _, moved, after = resolve(
+    contacts = find_contacts(settings, position, jnp.zeros((), int))
+    _, moved, after = touch(
         settings,
         contacts,
         jnp.asarray(inverse),
@@ -137,6 +180,7 @@ def pair(gap: float, speed: float, *, sideways: float = 0.0, masses=(1.0, 3.0), 
         jnp.asarray(1e-3),
         position,
         velocity,
+        passes=1,
     )
     return np.asarray(moved - position), np.asarray(after), np.repeat(masses, 3)
 
@@ -417,7 +461,7 @@ def test_without_self_contact_nothing_of_it_is_compiled():
     actions = jnp.asarray(displacement, jnp.float32)
     run = partial(colliding_rollout, plain, pickers, at_rest(position))
     lowered = jax.jit(run).lower(actions)
-    assert "stablehlo.sort" not in lowered.as_text()
+    assert "jaxsimp_touch" not in lowered.as_text()
     assert jax.jit(run)(actions).missed is None
 
 
