@@ -1,7 +1,7 @@
 """Self-contact of one body on the CPU: who may touch whom, and impulses, compiled by numba.
 
-The nearest are found by cells: particles are sorted into cubes as wide as is looked, and compared
-with those in the same cube and the next ones. The work follows what is there; whatever is within
+The nearest are found by cells: particles are sorted, along the two axes in which they are spread
+widest, into cells as wide as is looked, and compared with those in the same cell and the next. The work follows what is there; whatever is within
 reach is found, however much that is. What a contact does is told, and differentiated, in
 self_contact.py; this is the same without derivatives, and looks only at what is near.
 """
@@ -13,10 +13,18 @@ from typing import no_type_check  # numba needs the functions as they are, not w
 import numpy as np
 from numba import njit
 
-from jaxsimp.dynamics.foreign import cube, matrix, register, scalar, vector
+from jaxsimp.dynamics.foreign import cube, matrix, pass_on, register, scalar, vector
 
 NUM_OPERANDS, NUM_RESULTS = 14, 9
-FAR = 1e4
+LANES = 16
+"""Particles that are compared at a time."""
+DE_BRUIJN = np.uint32(0x077CB531)
+"""Any five bits of it in a row are other than any other five: shifts of it tell single bits."""
+BIT_PLACES = np.empty(32, np.int64)
+BIT_PLACES[[(int(DE_BRUIJN) << place & 0xFFFFFFFF) >> 27 for place in range(32)]] = range(32)
+TINY = np.float32(1e-20)
+"""Squared length below which a vector has no direction."""
+FAR = np.float32(1e4)
 """What is farther away than this, metres, has no say in where cells are."""
 
 
@@ -30,6 +38,8 @@ def touch_target(dtype: np.dtype) -> str:
 
 @no_type_check
 def _kernel_of(real):
+    words = np.dtype(real).itemsize // 4
+
     @njit
     def kernel(operands, results):
         position, velocity = matrix(results[0], real), matrix(results[1], real)
@@ -37,11 +47,9 @@ def _kernel_of(real):
         found_at, allowance = matrix(results[4], real), vector(results[5], real)
         carried, missed = vector(results[6], real), scalar(results[7], np.int32)
         renewed = scalar(results[8], np.bool_)
-        # XLA hands out the operands' own memory where it can.
-        position[:], velocity[:] = matrix(operands[0], real), matrix(operands[1], real)
-        partner[:], direction[:] = matrix(operands[2], np.int32), cube(operands[3], real)
-        found_at[:], allowance[:] = matrix(operands[4], real), vector(operands[5], real)
-        carried[:], missed[:] = vector(operands[6], real), scalar(operands[7], np.int32)
+        for place in range(8):
+            is_real = place != 2 and place != 7
+            pass_on(operands[place], results[place], words if is_real else 1)
         inverse_mass, numbers = vector(operands[8], real), vector(operands[9], real)
         frame, apart = matrix(operands[10], np.int32), matrix(operands[11], real)
         is_sheet, passes = scalar(operands[12], np.bool_)[0], scalar(operands[13], np.int32)[0]
@@ -83,8 +91,8 @@ def _resolve(position, velocity, partner, direction, carried, inverse_mass, numb
     count, missed = position.shape[1], 0
     shares, lying = np.empty(count, real), np.empty(count, real)
     total = np.empty((count, 6), real)
-    first, second = np.empty(2 * count, np.int32), np.empty(2 * count, np.int32)
-    side = np.empty(2 * count, np.int32)
+    first, second = np.empty(2 * count, np.uint32), np.empty(2 * count, np.uint32)
+    side = np.empty(2 * count, np.uint32)
     own, others = np.empty(2 * count, real), np.empty(2 * count, real)
     gaps, closing = np.empty(2 * count, real), np.empty(2 * count, real)
     zero, one, half = real(0), real(1), real(0.5)
@@ -94,7 +102,7 @@ def _resolve(position, velocity, partner, direction, carried, inverse_mass, numb
         touching = 0
         for k in range(2):
             for i in range(count):
-                j = partner[k, i]
+                j = np.uint32(partner[k, i])
                 if j == i:
                     continue
                 nx, ny, nz = direction[0, k, i], direction[1, k, i], direction[2, k, i]
@@ -129,7 +137,8 @@ def _resolve(position, velocity, partner, direction, carried, inverse_mass, numb
                 own[touching], others[touching], gaps[touching] = mine, yours, gap
                 closing[touching] = lacking
                 touching += 1
-        total[:] = zero
+        if touching > 0:
+            total[:] = zero
         for each in range(touching):
             i, j, k = first[each], second[each], side[each]
             mine, yours, gap, lacking = own[each], others[each], gaps[each], closing[each]
@@ -162,6 +171,8 @@ def _resolve(position, velocity, partner, direction, carried, inverse_mass, numb
         for i in range(count):
             lies = position[2, i] < floor + real(0.1) * thickness
             carried[i] = one if lies else lying[i]
+            if not shares[i] > zero:
+                continue
             w = inverse_mass[i]
             position[0, i] += w * total[i, 0]
             position[1, i] += w * total[i, 1]
@@ -181,114 +192,149 @@ def _find(position, partner, direction, found_at, allowance, numbers, frame, apa
     count = position.shape[1]
     adjacent, thickness, slack = numbers[0] * numbers[0], numbers[1], numbers[3]
     squash, level, touching, reach = numbers[4], numbers[8], numbers[9], numbers[10]
-    order, start, shape = _sorted_into_cells(position, reach)
-    normal = np.empty((count, 3), real)
-    known = np.zeros(count, np.bool_)
-    nearest = np.full((2, count), reach * reach, real)
-    for k in range(2):
-        for i in range(count):
-            partner[k, i] = i
-    # Cells in the same order of coordinates as `_sorted_into_cells`; each pair is met once: in
-    # the cell itself, its follower along the last axis, or one of four rows of three cells.
-    x = np.empty((3, count), real)
-    rest = np.empty((3, count), real)
+    search, half = numbers[11], real(0.5)
+    order, start, rows, columns = _sorted_into_cells(position, search)
+    across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
+    farthest = search * search
+    clear = np.full(count, farthest, real)
+    nearest = np.full((count, 2), reach * reach, real)
+    best = np.empty((count, 2), np.uint32)
+    points = np.full((6, count + LANES), real(FAR))
     for place in range(count):
+        i = order[place]
+        best[i, 0] = best[i, 1] = i
         for axis in range(3):
-            x[axis, place] = position[axis, order[place]]
-            rest[axis, place] = apart[axis, order[place]]
-    for a in range(shape[0]):
-        for b in range(shape[1]):
-            for c in range(shape[2]):
-                cell = (a * shape[1] + b) * shape[2] + c
-                low, high = start[cell], start[cell + 1]
-                if low == high:
-                    continue
-                for row in range(5):
-                    u = a + (1 if row > 1 else 0)
-                    v = b + (row - 3 if row > 1 else row)
-                    if u >= shape[0] or v < 0 or v >= shape[1]:
-                        continue
-                    line = (u * shape[1] + v) * shape[2]
-                    from_ = start[line + max(c - 1, 0)]
-                    to = start[line + min(c + 2, shape[2])]
-                    for place in range(low, high):
-                        begin = place + 1 if row == 0 else from_
-                        for other in range(begin, to):
-                            dx = x[0, other] - x[0, place]
-                            dy = x[1, other] - x[1, place]
-                            dz = x[2, other] - x[2, place]
-                            squared = dx * dx + dy * dy + dz * dz
+            points[axis, place] = position[axis, i]
+            points[3 + axis, place] = apart[axis, i]
+    # Each pair is met in the row of one that comes later, or in the next row.
+    for row in range(rows):
+        for column in range(columns):
+            cell = row * columns + column
+            begin, end = max(column - 1, 0), min(column + 2, columns)
+            last = start[row * columns + end]
+            next_first, next_last = 0, 0
+            if row + 1 < rows:
+                next_first = start[(row + 1) * columns + begin]
+                next_last = start[(row + 1) * columns + end]
+            for place in range(start[cell], start[cell + 1]):
+                for part in range(2):
+                    low, high = (place + 1, last) if part == 0 else (next_first, next_last)
+                    for block in range(low, high, LANES):
+                        near = _near(points, place, block, farthest, adjacent)
+                        while near:
+                            lane = _lowest(near)
+                            near &= near - np.uint32(1)
+                            other = block + lane
+                            x = points[0, other] - points[0, place]
+                            y = points[1, other] - points[1, place]
+                            z = points[2, other] - points[2, place]
+                            squared = x * x + y * y + z * z
+                            i, j = order[place], order[other]
+                            clear[i], clear[j] = min(clear[i], squared), min(clear[j], squared)
                             if squared >= reach * reach:
                                 continue
-                            rx = rest[0, other] - rest[0, place]
-                            ry = rest[1, other] - rest[1, place]
-                            rz = rest[2, other] - rest[2, place]
-                            if rx * rx + ry * ry + rz * rz < adjacent:
-                                continue
-                            i, j = order[place], order[other]
+                            for each in (i, j):
+                                if not known[each]:
+                                    known[each] = True
+                                    across[each] = _across(each, position, frame, is_sheet)
                             _compare(
-                                i, j, dx, dy, dz, squared, position, frame, is_sheet, squash,
-                                level, normal, known, nearest, partner,
+                                i, j, x, y, z, squared, across, is_sheet, numbers, nearest, best
                             )
                             _compare(
-                                j, i, -dx, -dy, -dz, squared, position, frame, is_sheet, squash,
-                                level, normal, known, nearest, partner,
+                                j, i, -x, -y, -z, squared, across, is_sheet, numbers, nearest, best
                             )
     stretch = sqrt(real(1) + squash)
     for i in range(count):
-        closest = sqrt(min(nearest[0, i], nearest[1, i]))
-        allowance[i] = max(slack, (closest - touching) / (real(2) * stretch))
+        closest = sqrt(min(nearest[i, 0], nearest[i, 1]))
+        # What is beside a particle may come nearer by its distance, what is above by less.
+        free = max((closest - touching) / stretch, sqrt(clear[i]) - touching)
+        allowance[i] = max(slack, half * free)
         for axis in range(3):
             found_at[axis, i] = position[axis, i]
         for k in range(2):
-            _direct(i, partner[k, i], k, position, frame, is_sheet, thickness, level, direction)
+            j = best[i, k]
+            partner[k, i] = j
+            if j != i:
+                _direct(i, j, k, position, across, is_sheet, thickness, level, direction)
+
+
+@njit(inline="always")
+@no_type_check
+def _near(points, place, block, farthest, adjacent):
+    """Which of a block a particle may come to touch, as bits.
+
+    All at a time: with unsigned indices and a fixed count, and only then, LLVM makes vectors.
+    """
+    at, first = np.uintp(place), np.uintp(block)
+    x, y, z = points[0, at], points[1, at], points[2, at]
+    u, v, w = points[3, at], points[4, at], points[5, at]
+    near = np.uint32(0)
+    for lane in range(LANES):
+        other = first + np.uintp(lane)
+        dx, dy, dz = points[0, other] - x, points[1, other] - y, points[2, other] - z
+        du, dv, dw = points[3, other] - u, points[4, other] - v, points[5, other] - w
+        is_near = dx * dx + dy * dy + dz * dz < farthest
+        is_near &= du * du + dv * dv + dw * dw >= adjacent
+        near |= np.uint32(is_near) << np.uint32(lane)
+    return near
+
+
+@njit(inline="always")
+@no_type_check
+def _lowest(bits):
+    """The place of the lowest bit that is set."""
+    alone = bits & (~bits + np.uint32(1))
+    return BIT_PLACES[(alone * DE_BRUIJN & np.uint32(0xFFFFFFFF)) >> np.uint32(27)]
 
 
 @njit
 @no_type_check
 def _sorted_into_cells(position, width):
-    """Particles by cell, where each cell's begin, and how many cells there are along each axis."""
+    """Particles by cell along the two widest axes, where those of a cell begin, and the shape."""
     count = position.shape[1]
-    low, cells = np.empty(3, position.dtype), np.empty(3, np.int64)
+    lows, extents = np.empty(3, position.dtype), np.empty(3, position.dtype)
+    for axis in range(3):
+        least, most = position.dtype.type(FAR), position.dtype.type(-FAR)
+        for i in range(count):
+            along = position[axis, i]
+            if -FAR < along < FAR:
+                least, most = min(least, along), max(most, along)
+        lows[axis], extents[axis] = least, max(most - least, position.dtype.type(0))
+    narrowest = np.argmin(extents)
+    first, second = (narrowest + 1) % 3, (narrowest + 2) % 3
     # No more cells than a few for each particle: what has flown apart gets wider ones.
-    while True:
-        number = 1.0
-        for axis in range(3):
-            least, most = position.dtype.type(FAR), position.dtype.type(-FAR)
-            for i in range(count):
-                along = position[axis, i]
-                if -FAR < along < FAR:
-                    least, most = min(least, along), max(most, along)
-            low[axis] = least
-            cells[axis] = 1 + (int((most - least) / width) if most > least else 0)
-            number *= cells[axis]
-        if number <= 8 * count + 64:
-            break
+    rows, columns = 1 + int(extents[first] / width), 1 + int(extents[second] / width)
+    while rows * columns > 4 * count + 64:
         width *= 2
-    start = np.zeros(cells[0] * cells[1] * cells[2] + 1, np.int32)
-    cell_of, order = np.empty(count, np.int32), np.empty(count, np.int32)
-    scale = 1 / width
+        rows, columns = 1 + int(extents[first] / width), 1 + int(extents[second] / width)
+    scale = np.float32(1) / width
+    start = np.zeros(rows * columns + 1, np.int64)
+    cell_of, order = np.empty(count, np.uint32), np.empty(count, np.uint32)
     for i in range(count):
-        cell = 0
-        for axis in range(3):
-            share = (position[axis, i] - low[axis]) * scale
-            # Whatever is not a number goes into the first.
-            inside = int(share) if 0 <= share < cells[axis] else 0
-            outermost = cells[axis] - 1 if share >= cells[axis] else inside
-            cell = cell * cells[axis] + outermost
-        cell_of[i] = cell
-        start[cell + 1] += 1
-    for cell in range(len(start) - 1):
+        row = _cell(position[first, i] - lows[first], scale, rows)
+        cell_of[i] = row * columns + _cell(position[second, i] - lows[second], scale, columns)
+        start[cell_of[i] + np.uint32(1)] += 1
+    for cell in range(rows * columns):
         start[cell + 1] += start[cell]
+    # From the end of each cell down: it is then where the cell begins, one place too far.
     for i in range(count - 1, -1, -1):
-        cell = cell_of[i] + 1
-        start[cell] -= 1
-        order[start[cell]] = i
-    # Each begin was moved one cell down by that.
-    for cell in range(len(start) - 1):
+        after = cell_of[i] + np.uint32(1)
+        start[after] -= 1
+        order[start[after]] = i
+    for cell in range(rows * columns):
         start[cell] = start[cell + 1]
-    start[len(start) - 1] = count
-    return order, start, cells
+    start[rows * columns] = count
+    return order, start, rows, columns
+
+
+@njit(inline="always")
+@no_type_check
+def _cell(along, scale, cells):
+    """The cell along an axis; the first for what is not a number, the last beyond the end."""
+    share = along * scale
+    if share >= cells:
+        return cells - 1
+    return int(share) if share >= 0 else 0
 
 
 @njit(inline="always")
@@ -312,67 +358,60 @@ def _across(i, position, frame, is_sheet):
 @no_type_check
 def _unit(x, y, z, otherwise_x, otherwise_y, otherwise_z):
     squared = x * x + y * y + z * z
-    if squared > 1e-20:
-        scale = 1 / sqrt(squared)
+    if squared > TINY:
+        scale = np.float32(1) / sqrt(squared)
         return x * scale, y * scale, z * scale
     return otherwise_x, otherwise_y, otherwise_z
 
 
 @njit(inline="always")
 @no_type_check
-def _compare(
-    i, j, dx, dy, dz, squared, position, frame, is_sheet, squash, level, normal, known, nearest,
-    partner,
-):
+def _compare(i, j, dx, dy, dz, squared, across, is_sheet, numbers, nearest, best):
     """Whether j, at (dx, dy, dz) of i, is the nearest so far on one side of i, or on both."""
-    if not known[i]:
-        known[i] = True
-        normal[i] = (0, 0, 1)
-        if is_sheet:
-            normal[i] = _across(i, position, frame, is_sheet)
-    above = normal[i, 0] * dx + normal[i, 1] * dy + normal[i, 2] * dz
+    # Around a rope there is room for more: its sides are above and below.
+    above = across[i, 0] * dx + across[i, 1] * dy + across[i, 2] * dz if is_sheet else dz
+    squash, level = numbers[4], numbers[8]
     squared = squared + squash * above * above
-    if above >= -level and squared < nearest[0, i]:
-        nearest[0, i] = squared
-        partner[0, i] = j
-    if above <= level and squared < nearest[1, i]:
-        nearest[1, i] = squared
-        partner[1, i] = j
+    # Selections, not branches: which way they go is anybody's guess.
+    is_best = (above >= -level) & (squared < nearest[i, 0])
+    nearest[i, 0] = squared if is_best else nearest[i, 0]
+    best[i, 0] = j if is_best else best[i, 0]
+    is_best = (above <= level) & (squared < nearest[i, 1])
+    nearest[i, 1] = squared if is_best else nearest[i, 1]
+    best[i, 1] = j if is_best else best[i, 1]
 
 
-@njit(inline="always")
+@njit
 @no_type_check
-def _direct(i, j, k, position, frame, is_sheet, thickness, level, direction):
+def _direct(i, j, k, position, across, is_sheet, thickness, level, direction):
     """The direction of a contact, see `self_contact.directions`."""
     real = position.dtype.type
     zero, one = real(0), real(1)
-    x, y, z = zero, zero, one
-    if i != j:
-        dx = position[0, i] - position[0, j]
-        dy = position[1, i] - position[1, j]
-        dz = position[2, i] - position[2, j]
-        sx, sy, sz = _unit(dx, dy, dz, zero, zero, one)
-        x, y, z = sx, sy, sz
-        mx, my, mz = _across(i, position, frame, is_sheet)
-        yx, yy, yz = _across(j, position, frame, is_sheet)
-        if is_sheet:
-            above = mx * dx + my * dy + mz * dz
-            below = yx * dx + yy * dy + yz * dz
-            p = -one if above < zero else one
-            q = -one if below < zero else one
-            bx, by, bz = p * mx + q * yx, p * my + q * yy, p * mz + q * yz
-            beside = max(abs(above), abs(below)) < level
-            if not beside and bx * bx + by * by + bz * bz >= one:
-                x, y, z = _unit(bx, by, bz, sx, sy, sz)
-        else:
-            along = mx * dx + my * dy + mz * dz
-            dx, dy, dz = dx - along * mx, dy - along * my, dz - along * mz
-            along = mx * yx + my * yy + mz * yz
-            yx, yy, yz = yx - along * mx, yy - along * my, yz - along * mz
-            turned = yx * yx + yy * yy + yz * yz
-            if turned > real(0.05):
-                part = (yx * dx + yy * dy + yz * dz) / turned
-                dx, dy, dz = dx - part * yx, dy - part * yy, dz - part * yz
-            if dx * dx + dy * dy + dz * dz >= level * level:
-                x, y, z = _unit(dx, dy, dz, sx, sy, sz)
+    dx = position[0, i] - position[0, j]
+    dy = position[1, i] - position[1, j]
+    dz = position[2, i] - position[2, j]
+    sx, sy, sz = _unit(dx, dy, dz, zero, zero, one)
+    x, y, z = sx, sy, sz
+    mx, my, mz = across[i, 0], across[i, 1], across[i, 2]
+    yx, yy, yz = across[j, 0], across[j, 1], across[j, 2]
+    if is_sheet:
+        above = mx * dx + my * dy + mz * dz
+        below = yx * dx + yy * dy + yz * dz
+        p = -one if above < zero else one
+        q = -one if below < zero else one
+        bx, by, bz = p * mx + q * yx, p * my + q * yy, p * mz + q * yz
+        beside = max(abs(above), abs(below)) < level
+        if not beside and bx * bx + by * by + bz * bz >= one:
+            x, y, z = _unit(bx, by, bz, sx, sy, sz)
+    else:
+        along = mx * dx + my * dy + mz * dz
+        dx, dy, dz = dx - along * mx, dy - along * my, dz - along * mz
+        along = mx * yx + my * yy + mz * yz
+        yx, yy, yz = yx - along * mx, yy - along * my, yz - along * mz
+        turned = yx * yx + yy * yy + yz * yz
+        if turned > real(0.05):
+            part = (yx * dx + yy * dy + yz * dz) / turned
+            dx, dy, dz = dx - part * yx, dy - part * yy, dz - part * yz
+        if dx * dx + dy * dy + dz * dz >= level * level:
+            x, y, z = _unit(dx, dy, dz, sx, sy, sz)
     direction[0, k, i], direction[1, k, i], direction[2, k, i] = x, y, z

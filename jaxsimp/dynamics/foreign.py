@@ -16,7 +16,7 @@ from numba.extending import intrinsic
 
 # Offsets into the structures of the interface, in words of 8 bytes.
 FRAME_WORDS, EXTENSIONS, API, OPERANDS, RESULTS = 15, 1, 2, 9, 14
-BUFFER_WORDS, DATA, DIMENSIONS = 6, 3, 5
+BUFFER_WORDS, DATA, RANK, DIMENSIONS = 6, 3, 4, 5
 IS_METADATA, METADATA, VERSION, TRAITS = 1, 3, 3, 4
 API_VERSION = 4
 
@@ -77,6 +77,22 @@ def cube(buffer, dtype):
     """A buffer of three axes."""
     shape = (_size(buffer, 0), _size(buffer, 1), _size(buffer, 2))
     return carray(_data(buffer), shape, dtype)
+
+
+@njit
+@no_type_check
+def pass_on(operand, result, item_words):
+    """Copy an operand to a result, unless XLA has them share memory; items in words of 4 bytes."""
+    source, target = _words(operand, BUFFER_WORDS), _words(result, BUFFER_WORDS)
+    if source[DATA] == target[DATA]:
+        return
+    size = item_words
+    for axis in range(source[RANK]):
+        size *= _size(operand, axis)
+    old = carray(_pointer(source[DATA]), (size,), np.int32)
+    new = carray(_pointer(target[DATA]), (size,), np.int32)
+    for word in range(size):
+        new[word] = old[word]
 
 
 @njit

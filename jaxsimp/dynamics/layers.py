@@ -17,6 +17,8 @@ SPARE = 1.05
 """Times the thickness that layers are held apart: what presses them pushes them in a little."""
 INTERVAL = 1
 """Default of the time steps from contact to contact."""
+AHEAD = 1
+"""Intervals for which is looked ahead: the farther, the more is found, and the longer it lasts."""
 MOST_LAYERS_OF_SHEETS = 1.1
 """Thicknesses that a picker may move in an interval."""
 MOST_LAYERS_OF_ROPES = 0.75
@@ -49,7 +51,7 @@ class SelfContact:
         adjacent: pairs closer than that at rest do not collide, metres.
         thickness: distance that layers are held apart, `SPARE` times the body's, metres.
         lateral: particles touch that are not farther apart along their layers, metres.
-        margin: how far pickers move in an interval, metres.
+        margin: how far is looked beyond what touches, metres.
         slack: how far one that touches may move until contacts are looked up again, metres.
         squash: see `nearest_above`.
         friction: Coulomb coefficient between layers.
@@ -123,7 +125,7 @@ def make_self_contact(
         adjacent=array(max(1.25 * body.rest_length.max(), 2 * thickness)),
         thickness=array(SPARE * thickness),
         lateral=array(1.2 * covering),
-        margin=array(top_speed * seconds),
+        margin=array(AHEAD * top_speed * seconds),
         slack=array(0.25 * covering),
         squash=array(stretch - 1),
         friction=array(friction),

@@ -31,6 +31,8 @@ from jaxsimp.dynamics.layers import SelfContact
 
 LEVEL = 0.3
 """Layers closer than this, of the thickness, count as side by side."""
+SEARCH = 1.5
+"""How far is looked for what may come near, in distances at which it is listed."""
 Padded = Float[Array, "3 NHH"]
 """Something of every particle, with the halo of springs.py on either side."""
 
@@ -117,6 +119,7 @@ def _touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
     )
     real, stretch = position.dtype, jnp.sqrt(1 + settings.squash)
     near = stretch * settings.thickness
+    reach = jnp.hypot(settings.lateral, near + stretch * settings.margin)
     numbers = [
         settings.adjacent,
         settings.thickness,
@@ -128,7 +131,8 @@ def _touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
         seconds,
         LEVEL * settings.thickness,
         jnp.hypot(settings.lateral, near),
-        jnp.hypot(settings.lateral, near + stretch * settings.margin),
+        reach,
+        SEARCH * reach,
     ]
     changing = [
         position,

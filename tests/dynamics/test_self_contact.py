@@ -23,7 +23,7 @@ from jaxsimp.dynamics import (
     rollout,
     settle,
 )
-from jaxsimp.dynamics.layers import MOST_LAYERS_OF_ROPES, SPARE, make_self_contact
+from jaxsimp.dynamics.layers import AHEAD, MOST_LAYERS_OF_ROPES, SPARE, make_self_contact
 from jaxsimp.dynamics.self_contact import _across, directions, find_contacts, resolve, touch
 from jaxsimp.planning import default_layout
 from jaxsimp.tasks import make_task
@@ -303,7 +303,7 @@ def test_ropes_crossed_at_speed_do_not_pass_through_each_other(share):
     run = jax.jit(partial(settle, num_steps=3))
     for _ in range(5):
         simulation, position = crossing(float(rng.choice([-0.5, 0.0, 0.4])))
-        margin = float(simulation.self_contact.margin)
+        margin = float(simulation.self_contact.margin) / AHEAD
         position = position.copy()
         position[:17] += [*rng.uniform(-0.015, 0.015, 2), 0.015 + rng.uniform(0, margin)]
         velocity = np.zeros_like(position)
