@@ -214,8 +214,8 @@ class TransferOptions(PlanOptions):
         Raises:
             ValueError: if an option has a value that it cannot have.
         """
-        planning = "robust" if self.robust else "nominal"
-        return dataclasses.replace(super().configuration(), planning=planning)
+        study = super().configuration()
+        return dataclasses.replace(study, planning="robust") if self.robust else study
 
     def transfer(self) -> transfer.Study:
         """The study that these options ask for.

@@ -255,7 +255,7 @@ def two_sheets():
     twice = ("mass", "rest_length", "stiffness", "damping")
     return dataclasses.replace(
         sheet,
-        rest=np.concatenate([sheet.rest, sheet.rest + [0.0, 0.2, 0.0]]),
+        rest=np.concatenate([sheet.rest, sheet.rest + np.array([0.0, 0.2, 0.0])]),
         springs=np.concatenate([sheet.springs, sheet.springs + 81]),
         faces=np.concatenate([sheet.faces, sheet.faces + 81]),
         shape=(162,),
@@ -266,14 +266,14 @@ def two_sheets():
 @pytest.mark.parametrize("speed", [0.3, 1.0])
 def test_a_layer_that_is_laid_down_fast_stays_above_the_one_below(speed):
     # A fold is laid down at 1 m/s. A critically damped contact of time constant c that is hit at a
-    # speed v gives way by v c / e: at 1 m/s and 4 ms by 1.5 mm of the thickness of 4 mm; at MuJoCo's
-    # own 20 ms by 7 mm. (With those, the layers end in one plane even at 0.3 m/s.)
+    # speed v gives way by v c / e: at 1 m/s and 4 ms by 1.5 mm of the thickness of 4 mm, at the
+    # 20 ms of MuJoCo's default by 7 mm. (With those the layers end in one plane, at 0.3 m/s, too.)
     body = two_sheets()
     model = make_model(body, "full")
     data = mujoco.MjData(model)
     start = body.rest.copy()
     start[:81, 2] = body.radius
-    start[81:] = start[:81] + [0.004, 0.003, 0.03]
+    start[81:] = start[:81] + np.array([0.004, 0.003, 0.03])
     data.qpos[:] = (start - body.rest).ravel()
     data.qvel.reshape(-1, 3)[81:, 2] = -speed
     step(model, data, 0.5)
