@@ -21,13 +21,19 @@ from experiments import records
 from jaxsimp.planning import (
     ENCODINGS,
     CEMConfig,
+    Ensemble,
     Planner,
+    Spread,
+    make_ensemble,
     save_plan,
 )
 from jaxsimp.simplify import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
 
 ACTION_SPACES = ("key_points", "all_particles")
+PLANNING = ("nominal", "robust")
+"""Plans are judged in the body's own physics alone, or in an ensemble."""
+ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
 PLANS_FOLDER = "plans"
 
@@ -96,6 +102,7 @@ class Study:
         budget: name of the budget.
         settings: CEM settings that replace the budget's.
         num_actions: actions in a plan, instead of the budget's or the task's.
+        planning: one of `PLANNING`.
     """
 
     name: str
@@ -110,9 +117,11 @@ class Study:
     budget: Literal["default", "paper", "goals", "smoke"]
     settings: dict[str, Any]
     num_actions: int | None
+    planning: Literal["nominal", "robust"]
 
     def __post_init__(self) -> None:
         _require_known("task", self.tasks, task_names())
+        _require_known("planning", (self.planning,), PLANNING)
         _require_known("method", (self.method,), tuple(METHODS))
         _require_known("action space", self.action_spaces, ACTION_SPACES)
         _require_known("pick encoding", self.pick_encodings, tuple(ENCODINGS))
@@ -135,12 +144,18 @@ class Study:
         """The search settings of a task."""
         return dataclasses.replace(BUDGETS[self.budget].config(task), **self.settings)
 
+    def ensemble(self, task: Task) -> Ensemble | None:
+        """The physics that plans are judged in, if it is not the body's own alone."""
+        return make_ensemble(task, ENSEMBLE_SIZE) if self.planning == "robust" else None
+
     def identity(self) -> dict[str, Any]:
-        """What two folders of results must share: the options, and what a budget's name means."""
+        """What two folders of results must share: the options, and what their names mean."""
         search = {
             name: dataclasses.asdict(self.search_config(self.task(name))) for name in self.tasks
         }
-        return {**dataclasses.asdict(self), "search": search}
+        spread = {"size": ENSEMBLE_SIZE, "spread": dataclasses.asdict(Spread())}
+        ensemble = spread if self.planning == "robust" else None
+        return {**dataclasses.asdict(self), "search": search, "ensemble": ensemble}
 
     def runs(self, task: str) -> Iterator[tuple[str, str, int]]:
         """Action space, encoding and seed of every run of a task."""
@@ -193,7 +208,7 @@ def _run_all(
     planners, seconds = {}, {}
     for name in (name for name, runs in left.items() if runs):
         task = study.task(name)
-        planners[name] = Planner(task, study.search_config(task))
+        planners[name] = Planner(task, study.search_config(task), ensemble=study.ensemble(task))
         seconds[name] = planners[name].estimate_seconds() * len(left[name])
         console.print(
             f"{name}: compiled in {planners[name].compile_seconds:.1f} s; "
@@ -213,6 +228,7 @@ def _run_all(
             for run in left[name]:
                 advance = partial(progress.advance, bar)
                 row = _run(planner, models[name], run, folder, advance)
+                row["planning"] = study.planning
                 row["success"] = (row["final_score"] or 0.0) >= study.success_score
                 row["environment"] = environment
                 row["compile_seconds"] += compile_seconds

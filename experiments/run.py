@@ -92,6 +92,7 @@ class PlanOptions:
             budget="smoke" if self.smoke else self.budget,
             settings=given,
             num_actions=self.num_actions,
+            planning="nominal",
         )
 
     def run(self, console: Console) -> None:
@@ -202,8 +203,19 @@ class TransferOptions(PlanOptions):
     """Particles that may be grasped."""
     pick_encodings: tuple[str, ...] = ("categorical",)
     """How CEM encodes what is grasped."""
+    robust: bool = False
+    """Judge plans in an ensemble of physics, instead of the body's own alone."""
     plans: Path | None = None
     """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
+
+    def configuration(self) -> Study:
+        """The study of the plans that are found.
+
+        Raises:
+            ValueError: if an option has a value that it cannot have.
+        """
+        study = super().configuration()
+        return dataclasses.replace(study, planning="robust") if self.robust else study
 
     def transfer(self) -> transfer.Study:
         """The study that these options ask for.
@@ -211,6 +223,10 @@ class TransferOptions(PlanOptions):
         Raises:
             ValueError: if an option has a value that it cannot have.
         """
+        if self.plans and self.robust:
+            raise ValueError(
+                f"--robust finds plans, and those of {self.plans} are found; leave one of them out"
+            )
         planned = transfer.planned_study(self.plans) if self.plans else self.configuration()
         source = str(self.plans) if self.plans else None
         return transfer.Study(planned, source, self.TRANSFER_SCORE)
@@ -241,7 +257,8 @@ STUDIES: dict[str, type[Options]] = {
 
 def results_folder(options: Options) -> Path:
     """Where results go."""
-    name = f"{options.NAME}-smoke" if options.smoke else options.NAME
+    robust = isinstance(options, TransferOptions) and options.robust
+    name = options.NAME + "-robust" * robust + "-smoke" * options.smoke
     return options.out or Path("results") / name
 
 

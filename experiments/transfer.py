@@ -118,8 +118,8 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
 
 def _row_of_plan(row: dict[str, Any]) -> dict[str, Any]:
     """What a replay's row takes over from that of its plan."""
-    names = ("task", "seed", "action_space", "pick_encoding", "final_score", "plan")
-    return {"planning": row.get("planning", "nominal")} | {name: row[name] for name in names}
+    names = ("planning", "task", "seed", "action_space", "pick_encoding", "final_score", "plan")
+    return {name: row[name] for name in names}
 
 
 def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:

@@ -246,6 +246,73 @@ def test_strands_of_a_crossed_rope_lie_on_each_other_only_in_full():
     assert heights["full"] > 2 * body.radius
 
 
+# --- contacts -------------------------------------------------------------------------------------
+
+
+def two_sheets():
+    """Two square sheets of 9 x 9 particles, side by side, in one body."""
+    sheet = cloth((9, 9), (0.1, 0.1), mass=0.002)
+    twice = ("mass", "rest_length", "stiffness", "damping")
+    return dataclasses.replace(
+        sheet,
+        rest=np.concatenate([sheet.rest, sheet.rest + np.array([0.0, 0.2, 0.0])]),
+        springs=np.concatenate([sheet.springs, sheet.springs + 81]),
+        faces=np.concatenate([sheet.faces, sheet.faces + 81]),
+        shape=(162,),
+        **{name: np.tile(getattr(sheet, name), 2) for name in twice},
+    )
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0])
+def test_a_layer_that_is_laid_down_fast_stays_above_the_one_below(speed):
+    # A fold is laid down at 1 m/s. A critically damped contact of time constant c that is hit at a
+    # speed v gives way by v c / e: at 1 m/s and 4 ms by 1.5 mm of the thickness of 4 mm, at the
+    # 20 ms of MuJoCo's default by 7 mm. (With those the layers end in one plane, at 0.3 m/s, too.)
+    body = two_sheets()
+    model = make_model(body, "full")
+    data = mujoco.MjData(model)
+    start = body.rest.copy()
+    start[:81, 2] = body.radius
+    start[81:] = start[:81] + np.array([0.004, 0.003, 0.03])
+    data.qpos[:] = (start - body.rest).ravel()
+    data.qvel.reshape(-1, 3)[81:, 2] = -speed
+    step(model, data, 0.5)
+    lower, upper = positions(body, data)[:81, 2], positions(body, data)[81:, 2]
+    # They rest a thickness apart, but for what the soft contacts of a light sheet give.
+    np.testing.assert_allclose(lower, body.radius, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(upper - lower, 2 * body.radius, rtol=0, atol=2e-4)
+
+
+def speed_down_a_slope(variant, slope, seconds):
+    """Of a square cloth of friction 0.5 that was put on it at rest; gravity is turned."""
+    body = cloth((5, 5), (0.1, 0.1), drag=0.0)
+    model = make_model(body, variant)
+    model.opt.gravity[:] = [GRAVITY * np.sin(slope), 0.0, -GRAVITY * np.cos(slope)]
+    data = mujoco.MjData(model)
+    data.qpos.reshape(-1, 3)[:, 2] = body.radius
+    step(model, data, seconds)
+    return data.qvel.reshape(-1, 3)[:, 0].mean(), model.opt.timestep
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_friction_holds_creeps_no_faster_than_the_closed_form(variant):
+    # MuJoCo's friction that holds is a damper. Of impedance d and time constant c, it leaves the
+    # share 1 - d of the pull, which d times its own 2 v / (0.95 c) balances; d is 0.9 where a
+    # contact is hardly pressed in. Pyramidal cones give way by up to twice as much.
+    speed, time_step = speed_down_a_slope(variant, 0.3, 0.2)
+    closed = 0.1 / 0.9 * GRAVITY * np.sin(0.3) * 0.95 * 2 * time_step / 2
+    assert closed / 2 < speed < 2 * closed
+    assert speed < 3e-3
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_what_friction_does_not_hold_slides_as_coulomb_has_it(variant):
+    speed, _ = speed_down_a_slope(variant, 0.8, 0.3)
+    expected = 0.3 * GRAVITY * (np.sin(0.8) - 0.5 * np.cos(0.8))
+    # It hops on the soft table by a millimetre, and the share of a hop is missing: 20 %.
+    assert speed == pytest.approx(expected, rel=0.2)
+
+
 # --- files and wrong requests ---------------------------------------------------------------------
 
 

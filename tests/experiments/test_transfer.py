@@ -1,19 +1,22 @@
 """The study of transfer: what it leaves behind, going on, replaying an earlier study's plans."""
 
+import dataclasses
 import json
 import shutil
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
 
 from experiments import run
+from experiments.records import read_rows
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
-from jaxsimp.planning import load_plan
+from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, make_ensemble
 from jaxsimp.tasks import make_task, score, task_names
 
 TASKS = ("rope_straightening", "cloth_diagonal_folding")
@@ -111,6 +114,44 @@ def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
     assert command("transfer", "--plans", source, "--out", out) == 0
     assert not (out / "runs.jsonl").exists()
     assert finished(out)["transfer"] == finished(folder)["transfer"]
+
+
+@pytest.mark.slow
+def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
+    options = (*OPTIONS, "--tasks", "rope_straightening", "--robust")
+    out = tmp_path / "robust"
+    assert command(*options, "--out", out) == 0
+    (row,), (by_hand,) = finished(out)["transfer"], finished(out)["scripted"]
+    assert (row["planning"], by_hand["planning"]) == ("robust", "scripted")
+    assert "| rope_straightening | key points | robust |" in (out / "report.md").read_text()
+    # The search's cost of the plan is the one of the ensemble, not that of the body's own physics.
+    task = make_task("rope_straightening", 7)
+    task = dataclasses.replace(task, num_actions=1)
+    plan = jax.tree.map(lambda array: array[None], load_plan(out / row["plan"])[0])
+    robust, nominal = (
+        Planner(task, CEMConfig(1, 1, 1), Layout(), ensemble=ensemble).costs(
+            task.episode_fn(0), plan
+        )[0]
+        for ensemble in (make_ensemble(task, 4), None)
+    )
+    (found,) = read_rows(out / "runs.jsonl")
+    assert found["final_cost"] == pytest.approx(robust, rel=1e-5)  # float32
+    assert found["final_cost"] != pytest.approx(nominal, rel=1e-3)
+
+
+def test_robust_is_part_of_what_a_study_is():
+    nominal, robust = run.TransferOptions(smoke=True), run.TransferOptions(smoke=True, robust=True)
+    identities = [options.transfer().identity()["plans"] for options in (nominal, robust)]
+    differ = {name for name in identities[0] if identities[0][name] != identities[1][name]}
+    assert differ == {"planning", "ensemble"}
+    assert identities[1]["ensemble"]["size"] == 4
+    folders = {run.results_folder(options).name for options in (nominal, robust)}
+    assert folders == {"transfer-smoke", "transfer-robust-smoke"}
+
+
+def test_robust_is_refused_for_plans_that_are_found(tmp_path, capsys):
+    assert command("transfer", "--robust", "--plans", tmp_path, "--out", tmp_path / "new") == 2
+    assert "--robust finds plans" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_folder_without_plans_is_refused(tmp_path, capsys):
