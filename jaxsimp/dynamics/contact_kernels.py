@@ -1,14 +1,15 @@
 """Self-contact of one body on the CPU: who may touch whom, and impulses, compiled by numba.
 
 The nearest are found by cells: particles are sorted, along the two axes in which they are spread
-widest, into cells as wide as is looked, and compared with those in the same cell and the next. The work follows what is there; whatever is within
-reach is found, however much that is. What a contact does is told, and differentiated, in
-self_contact.py; this is the same without derivatives, and looks only at what is near.
+widest, into cells as wide as is looked, and compared with those in the same cell and the next.
+The work follows what is there; whatever is within reach is found, however much that is. What a
+contact does is told, and differentiated, in self_contact.py; this is the same without
+derivatives, and looks only at what is near.
 """
 
 from functools import cache
 from math import sqrt
-from typing import no_type_check  # numba needs the functions as they are, not wrapped in checks
+from typing import no_type_check  # numba needs functions as they are, not wrapped in checks
 
 import numpy as np
 from numba import njit
@@ -95,10 +96,12 @@ def _resolve(position, velocity, partner, direction, carried, inverse_mass, numb
     side = np.empty(2 * count, np.uint32)
     own, others = np.empty(2 * count, real), np.empty(2 * count, real)
     gaps, closing = np.empty(2 * count, real), np.empty(2 * count, real)
+    touched = np.empty(count, np.bool_)
     zero, one, half = real(0), real(1), real(0.5)
     for turn in range(passes):
         shares[:] = zero
         lying[:] = zero
+        touched[:] = False
         touching = 0
         for k in range(2):
             for i in range(count):
@@ -133,6 +136,7 @@ def _resolve(position, velocity, partner, direction, carried, inverse_mass, numb
                 yours = one - carried[j] if above else one
                 shares[i] += mine
                 shares[j] += yours
+                touched[i] = touched[j] = True
                 first[touching], second[touching], side[touching] = i, j, k
                 own[touching], others[touching], gaps[touching] = mine, yours, gap
                 closing[touching] = lacking
@@ -171,7 +175,7 @@ def _resolve(position, velocity, partner, direction, carried, inverse_mass, numb
         for i in range(count):
             lies = position[2, i] < floor + real(0.1) * thickness
             carried[i] = one if lies else lying[i]
-            if not shares[i] > zero:
+            if not touched[i]:
                 continue
             w = inverse_mass[i]
             position[0, i] += w * total[i, 0]

@@ -7,11 +7,14 @@ here matters: where the buffers of operands and results are, and how large.
 
 import ctypes
 from collections.abc import Callable
-from typing import Any, no_type_check  # numba needs the functions as they are, not wrapped in checks
+from typing import (
+    Any,
+    no_type_check,
+)  # numba needs the functions as they are, not wrapped in checks
 
 import jax
 import numpy as np
-from numba import carray, cfunc, njit, types
+from numba import carray, cfunc, njit, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
 # Offsets into the structures of the interface, in words of 8 bytes.

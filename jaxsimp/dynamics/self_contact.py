@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import PyTreeDef
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsimp.dynamics.layers import SelfContact
 
@@ -171,9 +171,7 @@ def _touch_jvp(
     partner, renewed = result[2], result[-1]
 
     def smooth(leaves: list[Array]) -> tuple[Array, Array, Array]:
-        settings, contacts, inverse_mass, floor, seconds, *moving = jax.tree.unflatten(
-            tree, leaves
-        )
+        settings, contacts, inverse_mass, floor, seconds, *moving = jax.tree.unflatten(tree, leaves)
         count = len(inverse_mass)
         halo = (moving[0].shape[1] - count) // 2
         position, velocity = (array[:, halo : halo + count] for array in moving)
@@ -250,17 +248,12 @@ def resolve(
 def directions(
     settings: SelfContact, partner: Int[Array, "2 N"], position: Float[Array, "3 N"]
 ) -> Float[Array, "3 2 N"]:
-    """Unit vectors from partners, square to both sheets or lines; up where there is no partner."""
+    """Unit vectors from partners, square to both sheets or lines; any where there is none."""
     across = _across(settings, position)
     away = position[:, None] - position[:, partner]
     direct = _directions_of_sheets if settings.is_sheet else _directions_of_lines
     mine = jnp.broadcast_to(across[:, None], away.shape)
-    direction = direct(settings.thickness, away, mine, across[:, partner])
-    listed = partner != jnp.arange(position.shape[1])[None]
-    upwards = jnp.zeros_like(direction).at[2].set(1.0)
-    return jnp.where(listed[None], direction, upwards)
-
-
+    return direct(settings.thickness, away, mine, across[:, partner])
 
 
 def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array, "3 N"]:

@@ -67,7 +67,7 @@ def _touch(
     assert contacts is not None
     seconds = settings.interval * simulation.time_step
     inverse_mass = jnp.where(motion.held, 0.0, 1.0 / simulation.mass)
-    contacts, *touched = touch(
+    contacts, position, velocity = touch(
         settings, contacts, inverse_mass, simulation.radius, seconds, *packed, passes=PASSES
     )
-    return tuple(touched), contacts
+    return (position, velocity), contacts
