@@ -22,6 +22,7 @@ from jaxsimp.planning import (
     ENCODINGS,
     CEMConfig,
     Ensemble,
+    MassSprings,
     Planner,
     Spread,
     make_ensemble,
@@ -31,8 +32,8 @@ from jaxsimp.simplify import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
 
 ACTION_SPACES = ("key_points", "all_particles")
-PLANNING = ("nominal", "robust")
-"""Plans are judged in the body's own physics alone, or in an ensemble."""
+PLANNING = ("nominal", "robust", "self_contact")
+"""Plans are judged in the body's own physics alone, in an ensemble, or with self-contact."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
 PLANS_FOLDER = "plans"
@@ -117,7 +118,7 @@ class Study:
     budget: Literal["default", "paper", "goals", "smoke"]
     settings: dict[str, Any]
     num_actions: int | None
-    planning: Literal["nominal", "robust"]
+    planning: Literal["nominal", "robust", "self_contact"]
 
     def __post_init__(self) -> None:
         _require_known("task", self.tasks, task_names())
@@ -208,7 +209,12 @@ def _run_all(
     planners, seconds = {}, {}
     for name in (name for name, runs in left.items() if runs):
         task = study.task(name)
-        planners[name] = Planner(task, study.search_config(task), ensemble=study.ensemble(task))
+        planners[name] = Planner(
+            task,
+            study.search_config(task),
+            engine=MassSprings(self_contact=study.planning == "self_contact"),
+            ensemble=study.ensemble(task),
+        )
         seconds[name] = planners[name].estimate_seconds() * len(left[name])
         console.print(
             f"{name}: compiled in {planners[name].compile_seconds:.1f} s; "

@@ -203,8 +203,8 @@ class TransferOptions(PlanOptions):
     """Particles that may be grasped."""
     pick_encodings: tuple[str, ...] = ("categorical",)
     """How CEM encodes what is grasped."""
-    robust: bool = False
-    """Judge plans in an ensemble of physics, instead of the body's own alone."""
+    planning: Literal["nominal", "robust", "self_contact"] = "nominal"
+    """What judges plans: the body's physics, an ensemble of them, or layers that touch, too."""
     plans: Path | None = None
     """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
 
@@ -215,7 +215,7 @@ class TransferOptions(PlanOptions):
             ValueError: if an option has a value that it cannot have.
         """
         study = super().configuration()
-        return dataclasses.replace(study, planning="robust") if self.robust else study
+        return dataclasses.replace(study, planning=self.planning)
 
     def transfer(self) -> transfer.Study:
         """The study that these options ask for.
@@ -223,9 +223,10 @@ class TransferOptions(PlanOptions):
         Raises:
             ValueError: if an option has a value that it cannot have.
         """
-        if self.plans and self.robust:
+        if self.plans and self.planning != "nominal":
             raise ValueError(
-                f"--robust finds plans, and those of {self.plans} are found; leave one of them out"
+                f"--planning {self.planning} finds plans, and those of {self.plans} are found; "
+                f"leave one of them out"
             )
         planned = transfer.planned_study(self.plans) if self.plans else self.configuration()
         source = str(self.plans) if self.plans else None
@@ -257,8 +258,8 @@ STUDIES: dict[str, type[Options]] = {
 
 def results_folder(options: Options) -> Path:
     """Where results go."""
-    robust = isinstance(options, TransferOptions) and options.robust
-    name = options.NAME + "-robust" * robust + "-smoke" * options.smoke
+    planning = options.planning if isinstance(options, TransferOptions) else "nominal"
+    name = options.NAME + f"-{planning}" * (planning != "nominal") + "-smoke" * options.smoke
     return options.out or Path("results") / name
 
 

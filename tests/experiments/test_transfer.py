@@ -16,7 +16,7 @@ from experiments import run
 from experiments.records import read_rows
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
-from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, make_ensemble
+from jaxsimp.planning import CEMConfig, Layout, MassSprings, Planner, load_plan, make_ensemble
 from jaxsimp.tasks import make_task, score, task_names
 
 TASKS = ("rope_straightening", "cloth_diagonal_folding")
@@ -118,7 +118,7 @@ def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
 
 @pytest.mark.slow
 def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
-    options = (*OPTIONS, "--tasks", "rope_straightening", "--robust")
+    options = (*OPTIONS, "--tasks", "rope_straightening", "--planning", "robust")
     out = tmp_path / "robust"
     assert command(*options, "--out", out) == 0
     (row,), (by_hand,) = finished(out)["transfer"], finished(out)["scripted"]
@@ -139,19 +139,44 @@ def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
     assert found["final_cost"] != pytest.approx(nominal, rel=1e-3)
 
 
-def test_robust_is_part_of_what_a_study_is():
-    nominal, robust = run.TransferOptions(smoke=True), run.TransferOptions(smoke=True, robust=True)
-    identities = [options.transfer().identity()["plans"] for options in (nominal, robust)]
-    differ = {name for name in identities[0] if identities[0][name] != identities[1][name]}
-    assert differ == {"planning", "ensemble"}
-    assert identities[1]["ensemble"]["size"] == 4
-    folders = {run.results_folder(options).name for options in (nominal, robust)}
-    assert folders == {"transfer-smoke", "transfer-robust-smoke"}
+def test_what_judges_plans_is_part_of_what_a_study_is():
+    options = [
+        run.TransferOptions(smoke=True, planning=each)
+        for each in ("nominal", "robust", "self_contact")
+    ]
+    nominal, robust, touching = (each.transfer().identity()["plans"] for each in options)
+    assert {name for name in nominal if nominal[name] != robust[name]} == {"planning", "ensemble"}
+    assert {name for name in nominal if nominal[name] != touching[name]} == {"planning"}
+    assert robust["ensemble"]["size"] == 4
+    assert [run.results_folder(each).name for each in options] == [
+        "transfer-smoke",
+        "transfer-robust-smoke",
+        "transfer-self_contact-smoke",
+    ]
+
+
+@pytest.mark.slow
+def test_plans_with_self_contact_are_those_of_its_physics(tmp_path):
+    out = tmp_path / "touching"
+    options = (*OPTIONS, "--tasks", "rope_folding", "--planning", "self_contact")
+    assert command(*options, "--out", out) == 0
+    (row,) = finished(out)["transfer"]
+    (found,) = read_rows(out / "runs.jsonl")
+    assert row["planning"] == "self_contact"
+    task = dataclasses.replace(make_task("rope_folding", 7), num_actions=1)
+    plan = load_plan(out / row["plan"])[0]
+    planner = Planner(task, CEMConfig(1, 1, 1), Layout(), engine=MassSprings(self_contact=True))
+    execution = planner.execute(task.episode_fn(0), plan)
+    assert execution.missed is not None
+    assert found["final_score"] == pytest.approx(execution.score, abs=1e-5)  # float32
 
 
 def test_robust_is_refused_for_plans_that_are_found(tmp_path, capsys):
-    assert command("transfer", "--robust", "--plans", tmp_path, "--out", tmp_path / "new") == 2
-    assert "--robust finds plans" in " ".join(capsys.readouterr().err.split())
+    assert (
+        command("transfer", "--planning", "robust", "--plans", tmp_path, "--out", tmp_path / "new")
+        == 2
+    )
+    assert "--planning robust finds plans" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_folder_without_plans_is_refused(tmp_path, capsys):
