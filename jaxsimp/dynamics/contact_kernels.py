@@ -14,7 +14,18 @@ from typing import no_type_check  # numba needs functions as they are, not wrapp
 import numpy as np
 from numba import njit
 
-from jaxsimp.dynamics.foreign import cube, matrix, pass_on, register, scalar, vector
+from jaxsimp.dynamics.foreign import (
+    OK,
+    compiled,
+    is_call,
+    matrix,
+    operands,
+    pass_on,
+    register,
+    results,
+    scalar,
+    vector,
+)
 
 NUM_OPERANDS, NUM_RESULTS = 14, 9
 LANES = 16
@@ -33,167 +44,180 @@ FAR = np.float32(1e4)
 def touch_target(dtype: np.dtype) -> str:
     """Name of the operation for `jax.ffi.ffi_call`, in float32 or float64."""
     name = f"jaxsimp_touch_{dtype.name}"
-    register(name, _kernel_of(dtype.type), NUM_OPERANDS, NUM_RESULTS)
+    register(name, {"float32": _touch_float32, "float64": _touch_float64}[dtype.name])
     return name
 
 
 @no_type_check
-def _kernel_of(real):
-    words = np.dtype(real).itemsize // 4
-
-    @njit
-    def kernel(operands, results):
-        position, velocity = matrix(results[0], real), matrix(results[1], real)
-        partner, direction = matrix(results[2], np.int32), cube(results[3], real)
-        found_at, allowance = matrix(results[4], real), vector(results[5], real)
-        carried, missed = vector(results[6], real), scalar(results[7], np.int32)
-        renewed = scalar(results[8], np.bool_)
-        for place in range(8):
-            is_real = place != 2 and place != 7
-            pass_on(operands[place], results[place], words if is_real else 1)
-        inverse_mass, numbers = vector(operands[8], real), vector(operands[9], real)
-        frame, apart = matrix(operands[10], np.int32), matrix(operands[11], real)
-        is_sheet, passes = scalar(operands[12], np.bool_)[0], scalar(operands[13], np.int32)[0]
-        halo = (position.shape[1] - len(carried)) // 2
-        here = position[:, halo : halo + len(carried)]
-        speed = velocity[:, halo : halo + len(carried)]
-        if passes > 0:
-            missed[0] += _resolve(
-                here, speed, partner, direction, carried, inverse_mass, numbers, passes
-            )
-        renewed[0] = _gone_too_far(here, found_at, allowance)
-        if renewed[0]:
-            _find(here, partner, direction, found_at, allowance, numbers, frame, apart, is_sheet)
-
-    return kernel
+def _touch_float32(frame):
+    if is_call(frame):
+        _touch(operands(frame, NUM_OPERANDS), results(frame, NUM_RESULTS), np.float32)
+    return OK
 
 
-@njit
+@no_type_check
+def _touch_float64(frame):
+    if is_call(frame):
+        _touch(operands(frame, NUM_OPERANDS), results(frame, NUM_RESULTS), np.float64)
+    return OK
+
+
+@compiled
+@no_type_check
+def _touch(sources, targets, real):
+    position, velocity = matrix(targets[0], real), matrix(targets[1], real)
+    pairs, direction = matrix(targets[2], np.int32), matrix(targets[3], real)
+    found_at, allowance = matrix(targets[4], real), vector(targets[5], real)
+    carried, missed = vector(targets[6], real), scalar(targets[7], np.int32)
+    renewed = scalar(targets[8], np.bool_)
+    for place in range(8):
+        is_real = place != 2 and place != 7
+        pass_on(sources[place], targets[place], position.itemsize // 4 if is_real else 1)
+    inverse_mass, numbers = vector(sources[8], real), vector(sources[9], real)
+    frame, apart = matrix(sources[10], np.int32), matrix(sources[11], real)
+    is_sheet, passes = scalar(sources[12], np.bool_)[0], scalar(sources[13], np.int32)[0]
+    halo = (position.shape[1] - len(carried)) // 2
+    here, speed = _rows(position, halo), _rows(velocity, halo)
+    if passes > 0:
+        missed[0] += _resolve(here, speed, pairs, direction, carried, inverse_mass, numbers, passes)
+    renewed[0] = _gone_too_far(here, found_at, allowance)
+    if renewed[0]:
+        _find(here, pairs, direction, found_at, allowance, numbers, frame, apart, is_sheet)
+
+
+@njit(inline="always")
+@no_type_check
+def _rows(array, halo):
+    """Rows by themselves, without the halo: numba then knows that elements lie side by side."""
+    end = array.shape[1] - halo
+    return array[0][halo:end], array[1][halo:end], array[2][halo:end]
+
+
+@compiled
 @no_type_check
 def _gone_too_far(position, found_at, allowance):
     far = False
     for i in range(len(allowance)):
         x, y, z = (
-            position[0, i] - found_at[0, i],
-            position[1, i] - found_at[1, i],
-            position[2, i] - found_at[2, i],
+            position[0][i] - found_at[0, i],
+            position[1][i] - found_at[1, i],
+            position[2][i] - found_at[2, i],
         )
         far |= not x * x + y * y + z * z <= allowance[i] * abs(allowance[i])
     return far
 
 
-@njit
+@compiled
 @no_type_check
-def _resolve(position, velocity, partner, direction, carried, inverse_mass, numbers, passes):
-    """Impulses and pushes, see `self_contact.resolve`; returns how many contacts were missed."""
-    real = position.dtype.type
+def _resolve(position, velocity, pairs, direction, carried, inverse_mass, numbers, passes):
+    """Impulses and pushes, see `self_contact.resolve`; returns how many contacts were missed.
+
+    Selections, not branches: what touches and what does not is anybody's guess.
+    """
+    real = carried.dtype.type
     thickness, reach = numbers[1], numbers[2] * numbers[2]
-    friction, floor, seconds, level = numbers[5], numbers[6], numbers[7], numbers[8]
-    count, missed = position.shape[1], 0
-    shares, lying = np.empty(count, real), np.empty(count, real)
-    total = np.empty((count, 6), real)
-    first, second = np.empty(2 * count, np.uint32), np.empty(2 * count, np.uint32)
-    side = np.empty(2 * count, np.uint32)
-    own, others = np.empty(2 * count, real), np.empty(2 * count, real)
-    gaps, closing = np.empty(2 * count, real), np.empty(2 * count, real)
-    touched = np.empty(count, np.bool_)
+    friction, floor, rate, level = numbers[5], numbers[6], real(1) / numbers[7], numbers[8]
+    (px, py, pz), (vx, vy, vz) = position, velocity
+    along_x, along_y, along_z = direction[0], direction[1], direction[2]
+    firsts, seconds = pairs[0], pairs[1]
+    count, num_pairs, missed = len(carried), _length(firsts, seconds), 0
+    shares, lying, total = np.empty(count, real), np.empty(count, real), np.empty((6, count), real)
+    push_x, push_y, push_z, kick_x, kick_y, kick_z = total
+    touching = np.empty(num_pairs + 1, np.uint32)
+    own, others = np.empty(num_pairs + 1, real), np.empty(num_pairs + 1, real)
+    gaps, closing = np.empty(num_pairs + 1, real), np.empty(num_pairs + 1, real)
     zero, one, half = real(0), real(1), real(0.5)
     for turn in range(passes):
-        shares[:] = zero
         lying[:] = zero
-        touched[:] = False
-        touching = 0
-        for k in range(2):
-            for i in range(count):
-                j = np.uint32(partner[k, i])
-                if j == i:
-                    continue
-                nx, ny, nz = direction[0, k, i], direction[1, k, i], direction[2, k, i]
-                x = position[0, i] - position[0, j]
-                y = position[1, i] - position[1, j]
-                z = position[2, i] - position[2, j]
-                distance = nx * x + ny * y + nz * z
-                if x * x + y * y + z * z - distance * distance >= reach:
-                    continue
-                if turn == 0 and distance < zero:
-                    missed += 1
-                gap = distance - thickness
-                below, above = nz < -half, nz > half
-                if gap < level:
-                    if above:
-                        lying[i] = max(lying[i], carried[j])
-                    elif below:
-                        lying[j] = max(lying[j], carried[i])
-                approach = (
-                    nx * (velocity[0, i] - velocity[0, j])
-                    + ny * (velocity[1, i] - velocity[1, j])
-                    + nz * (velocity[2, i] - velocity[2, j])
-                )
-                lacking = -max(gap, zero) / seconds - approach
-                if gap >= zero and lacking <= zero:
-                    continue
-                mine = one - carried[i] if below else one
-                yours = one - carried[j] if above else one
-                shares[i] += mine
-                shares[j] += yours
-                touched[i] = touched[j] = True
-                first[touching], second[touching], side[touching] = i, j, k
-                own[touching], others[touching], gaps[touching] = mine, yours, gap
-                closing[touching] = lacking
-                touching += 1
-        if touching > 0:
-            total[:] = zero
-        for each in range(touching):
-            i, j, k = first[each], second[each], side[each]
-            mine, yours, gap, lacking = own[each], others[each], gaps[each], closing[each]
+        shares[:] = zero
+        num_touching = np.uint32(0)
+        for place in range(num_pairs):
+            pair = np.uint32(place)
+            i, j = np.uint32(firsts[pair]), np.uint32(seconds[pair])
+            nx, ny, nz = along_x[pair], along_y[pair], along_z[pair]
+            x, y, z = px[i] - px[j], py[i] - py[j], pz[i] - pz[j]
+            distance = nx * x + ny * y + nz * z
+            near = x * x + y * y + z * z - distance * distance < reach
+            missed += near & (distance < zero) & (turn == 0)
+            gap = distance - thickness
+            lies, below, above = near & (gap < level), nz < -half, nz > half
+            mine, yours = carried[i], carried[j]
+            lying[i] = max(lying[i], yours if lies & above else zero)
+            lying[j] = max(lying[j], mine if lies & below else zero)
+            approach = nx * (vx[i] - vx[j]) + ny * (vy[i] - vy[j]) + nz * (vz[i] - vz[j])
+            lacking = -max(gap, zero) * rate - approach
+            touches = near & ((gap < zero) | (lacking > zero))
+            mine, yours = one - mine if below else one, one - yours if above else one
+            shares[i] += mine if touches else zero
+            shares[j] += yours if touches else zero
+            touching[num_touching] = pair
+            own[num_touching], others[num_touching] = mine, yours
+            gaps[num_touching], closing[num_touching] = gap, lacking
+            num_touching += np.uint32(touches)
+        table = floor + real(0.1) * thickness
+        for i in range(count):
+            carried[i] = one if pz[i] < table else lying[i]
+        if num_touching == 0:
+            continue
+        total[:] = zero
+        for each in range(num_touching):
+            place = np.uint32(each)
+            pair = touching[place]
+            i, j = np.uint32(firsts[pair]), np.uint32(seconds[pair])
+            mine, yours, gap = own[place], others[place], gaps[place]
             both = mine * inverse_mass[i] * shares[i] + yours * inverse_mass[j] * shares[j]
             if not both > zero:
                 continue
-            nx, ny, nz = direction[0, k, i], direction[1, k, i], direction[2, k, i]
-            x = velocity[0, i] - velocity[0, j]
-            y = velocity[1, i] - velocity[1, j]
-            z = velocity[2, i] - velocity[2, j]
+            per = one / both
+            nx, ny, nz = along_x[pair], along_y[pair], along_z[pair]
+            x, y, z = vx[i] - vx[j], vy[i] - vy[j], vz[i] - vz[j]
             approach = nx * x + ny * y + nz * z
             x, y, z = x - approach * nx, y - approach * ny, z - approach * nz
             squared = max(x * x + y * y + z * z, real(1e-12))
-            impulse = max(lacking, zero) / both
-            rub = min(half / both, friction * impulse / sqrt(squared))
-            push = min(max(-gap, zero), thickness) / both
+            impulse = max(closing[place], zero) * per
+            rub = min(half * per, friction * impulse / sqrt(squared))
             x, y, z = impulse * nx - rub * x, impulse * ny - rub * y, impulse * nz - rub * z
-            total[i, 0] += mine * push * nx
-            total[i, 1] += mine * push * ny
-            total[i, 2] += mine * push * nz
-            total[i, 3] += x
-            total[i, 4] += y
-            total[i, 5] += z
-            total[j, 0] -= yours * push * nx
-            total[j, 1] -= yours * push * ny
-            total[j, 2] -= yours * push * nz
-            total[j, 3] -= x
-            total[j, 4] -= y
-            total[j, 5] -= z
+            push = min(max(-gap, zero), thickness) * per
+            mine, yours = mine * push, yours * push
+            push_x[i] += mine * nx
+            push_y[i] += mine * ny
+            push_z[i] += mine * nz
+            push_x[j] -= yours * nx
+            push_y[j] -= yours * ny
+            push_z[j] -= yours * nz
+            kick_x[i] += x
+            kick_y[i] += y
+            kick_z[i] += z
+            kick_x[j] -= x
+            kick_y[j] -= y
+            kick_z[j] -= z
         for i in range(count):
-            lies = position[2, i] < floor + real(0.1) * thickness
-            carried[i] = one if lies else lying[i]
-            if not touched[i]:
-                continue
-            w = inverse_mass[i]
-            position[0, i] += w * total[i, 0]
-            position[1, i] += w * total[i, 1]
-            height = position[2, i]
-            position[2, i] = max(height + w * total[i, 2], min(height, floor))
-            velocity[0, i] += w * total[i, 3]
-            velocity[1, i] += w * total[i, 4]
-            velocity[2, i] += w * total[i, 5]
+            w, height = inverse_mass[i], pz[i]
+            px[i] += w * push_x[i]
+            py[i] += w * push_y[i]
+            pz[i] = max(height + w * push_z[i], min(height, floor))
+            vx[i] += w * kick_x[i]
+            vy[i] += w * kick_y[i]
+            vz[i] += w * kick_z[i]
     return missed
 
 
-@njit
+@njit(inline="always")
 @no_type_check
-def _find(position, partner, direction, found_at, allowance, numbers, frame, apart, is_sheet):
+def _length(firsts, seconds):
+    """How many pairs are listed: the rest are particles with themselves."""
+    length = 0
+    while length < len(firsts) and firsts[length] != seconds[length]:
+        length += 1
+    return length
+
+
+@compiled
+@no_type_check
+def _find(position, pairs, direction, found_at, allowance, numbers, frame, apart, is_sheet):
     """Look up the nearest on either side of each, and the directions of their contacts."""
-    real = position.dtype.type
-    count = position.shape[1]
+    real = position[0].dtype.type
+    count = len(position[0])
     adjacent, thickness, slack = numbers[0] * numbers[0], numbers[1], numbers[3]
     squash, level, touching, reach = numbers[4], numbers[8], numbers[9], numbers[10]
     search, half = numbers[11], real(0.5)
@@ -208,7 +232,7 @@ def _find(position, partner, direction, found_at, allowance, numbers, frame, apa
         i = order[place]
         best[i, 0] = best[i, 1] = i
         for axis in range(3):
-            points[axis, place] = position[axis, i]
+            points[axis, place] = position[axis][i]
             points[3 + axis, place] = apart[axis, i]
     # Each pair is met in the row of one that comes later, or in the next row.
     for row in range(rows):
@@ -247,19 +271,25 @@ def _find(position, partner, direction, found_at, allowance, numbers, frame, apa
                             _compare(
                                 j, i, -x, -y, -z, squared, across, is_sheet, numbers, nearest, best
                             )
-    stretch = sqrt(real(1) + squash)
+    stretch, length = sqrt(real(1) + squash), 0
     for i in range(count):
         closest = sqrt(min(nearest[i, 0], nearest[i, 1]))
         # What is beside a particle may come nearer by its distance, what is above by less.
         free = max((closest - touching) / stretch, sqrt(clear[i]) - touching)
         allowance[i] = max(slack, half * free)
         for axis in range(3):
-            found_at[axis, i] = position[axis, i]
+            found_at[axis, i] = position[axis][i]
+        above, below = best[i, 0], best[i, 1]
         for k in range(2):
             j = best[i, k]
-            partner[k, i] = j
-            if j != i:
-                _direct(i, j, k, position, across, is_sheet, thickness, level, direction)
+            # Each pair once: not those that have been met from the other side.
+            met = j < i and (best[j, 0] == i or best[j, 1] == i)
+            if j != i and not met and not (k == 1 and below == above):
+                pairs[0, length], pairs[1, length] = i, j
+                _direct(i, j, length, position, across, is_sheet, thickness, level, direction)
+                length += 1
+    pairs[0, length:] = 0
+    pairs[1, length:] = 0
 
 
 @njit(inline="always")
@@ -291,19 +321,19 @@ def _lowest(bits):
     return BIT_PLACES[(alone * DE_BRUIJN & np.uint32(0xFFFFFFFF)) >> np.uint32(27)]
 
 
-@njit
+@compiled
 @no_type_check
 def _sorted_into_cells(position, width):
     """Particles by cell along the two widest axes, where those of a cell begin, and the shape."""
-    count = position.shape[1]
-    lows, extents = np.empty(3, position.dtype), np.empty(3, position.dtype)
+    count = len(position[0])
+    real = position[0].dtype.type
+    lows, extents = np.empty(3, real), np.empty(3, real)
     for axis in range(3):
-        least, most = position.dtype.type(FAR), position.dtype.type(-FAR)
-        for i in range(count):
-            along = position[axis, i]
-            if -FAR < along < FAR:
-                least, most = min(least, along), max(most, along)
-        lows[axis], extents[axis] = least, max(most - least, position.dtype.type(0))
+        least, most = real(FAR), real(-FAR)
+        for at in position[axis]:
+            if -FAR < at < FAR:
+                least, most = min(least, at), max(most, at)
+        lows[axis], extents[axis] = least, max(most - least, real(0))
     narrowest = np.argmin(extents)
     first, second = (narrowest + 1) % 3, (narrowest + 2) % 3
     # No more cells than a few for each particle: what has flown apart gets wider ones.
@@ -311,12 +341,12 @@ def _sorted_into_cells(position, width):
     while rows * columns > 4 * count + 64:
         width *= 2
         rows, columns = 1 + int(extents[first] / width), 1 + int(extents[second] / width)
-    scale = np.float32(1) / width
+    scale, down, along = np.float32(1) / width, position[first], position[second]
     start = np.zeros(rows * columns + 1, np.int64)
     cell_of, order = np.empty(count, np.uint32), np.empty(count, np.uint32)
     for i in range(count):
-        row = _cell(position[first, i] - lows[first], scale, rows)
-        cell_of[i] = row * columns + _cell(position[second, i] - lows[second], scale, columns)
+        row = _cell(down[i] - lows[first], scale, rows)
+        cell_of[i] = row * columns + _cell(along[i] - lows[second], scale, columns)
         start[cell_of[i] + np.uint32(1)] += 1
     for cell in range(rows * columns):
         start[cell + 1] += start[cell]
@@ -345,15 +375,15 @@ def _cell(along, scale, cells):
 @no_type_check
 def _across(i, position, frame, is_sheet):
     """Unit normal of the sheet, or tangent of the rope, at a particle."""
-    real = position.dtype.type
+    real = position[0].dtype.type
     a, b, c, d = frame[0, i], frame[1, i], frame[2, i], frame[3, i]
-    x = position[0, a] - position[0, b]
-    y = position[1, a] - position[1, b]
-    z = position[2, a] - position[2, b]
+    x = position[0][a] - position[0][b]
+    y = position[1][a] - position[1][b]
+    z = position[2][a] - position[2][b]
     if is_sheet:
-        u = position[0, c] - position[0, d]
-        v = position[1, c] - position[1, d]
-        w = position[2, c] - position[2, d]
+        u = position[0][c] - position[0][d]
+        v = position[1][c] - position[1][d]
+        w = position[2][c] - position[2][d]
         x, y, z = y * w - z * v, z * u - x * w, x * v - y * u
     return _unit(x, y, z, real(0), real(0), real(1))
 
@@ -385,15 +415,15 @@ def _compare(i, j, dx, dy, dz, squared, across, is_sheet, numbers, nearest, best
     best[i, 1] = j if is_best else best[i, 1]
 
 
-@njit
+@compiled
 @no_type_check
-def _direct(i, j, k, position, across, is_sheet, thickness, level, direction):
+def _direct(i, j, pair, position, across, is_sheet, thickness, level, direction):
     """The direction of a contact, see `self_contact.directions`."""
-    real = position.dtype.type
+    real = position[0].dtype.type
     zero, one = real(0), real(1)
-    dx = position[0, i] - position[0, j]
-    dy = position[1, i] - position[1, j]
-    dz = position[2, i] - position[2, j]
+    dx = position[0][i] - position[0][j]
+    dy = position[1][i] - position[1][j]
+    dz = position[2][i] - position[2][j]
     sx, sy, sz = _unit(dx, dy, dz, zero, zero, one)
     x, y, z = sx, sy, sz
     mx, my, mz = across[i, 0], across[i, 1], across[i, 2]
@@ -418,4 +448,4 @@ def _direct(i, j, k, position, across, is_sheet, thickness, level, direction):
             dx, dy, dz = dx - part * yx, dy - part * yy, dz - part * yz
         if dx * dx + dy * dy + dz * dz >= level * level:
             x, y, z = _unit(dx, dy, dz, sx, sy, sz)
-    direction[0, k, i], direction[1, k, i], direction[2, k, i] = x, y, z
+    direction[0, pair], direction[1, pair], direction[2, pair] = x, y, z

@@ -20,8 +20,14 @@ from numba.extending import intrinsic
 # Offsets into the structures of the interface, in words of 8 bytes.
 FRAME_WORDS, EXTENSIONS, API, OPERANDS, RESULTS = 15, 1, 2, 9, 14
 BUFFER_WORDS, DATA, RANK, DIMENSIONS = 6, 3, 4, 5
+OK = 0
+"""What a handler returns: no error."""
 IS_METADATA, METADATA, VERSION, TRAITS = 1, 3, 3, 4
 API_VERSION = 4
+
+# What is compiled is kept on disk, and compiled anew when its own file changes, not when a file it
+# calls does: after a change here delete the .nbi and .nbc files in `__pycache__`.
+compiled = njit(cache=True)
 
 
 @intrinsic
@@ -74,15 +80,7 @@ def matrix(buffer, dtype):
     return carray(_data(buffer), (_size(buffer, 0), _size(buffer, 1)), dtype)
 
 
-@njit(inline="always")
-@no_type_check
-def cube(buffer, dtype):
-    """A buffer of three axes."""
-    shape = (_size(buffer, 0), _size(buffer, 1), _size(buffer, 2))
-    return carray(_data(buffer), shape, dtype)
-
-
-@njit
+@compiled
 @no_type_check
 def pass_on(operand, result, item_words):
     """Copy an operand to a result, unless XLA has them share memory; items in words of 4 bytes."""
@@ -98,43 +96,48 @@ def pass_on(operand, result, item_words):
         new[word] = old[word]
 
 
-@njit
+@compiled
 @no_type_check
-def _described(frame):
-    """Whether XLA asked what this function is, and was told."""
-    extension = frame[EXTENSIONS]
+def is_call(frame):
+    """Whether XLA calls a handler; or else it asked what the handler is, and was told."""
+    words = _words(frame, FRAME_WORDS)
+    extension = words[EXTENSIONS]
     if extension == 0 or (_words(extension, 2)[1] & 0xFFFFFFFF) != IS_METADATA:
-        return False
+        return True
     metadata = _words(_words(extension, METADATA + 1)[METADATA], TRAITS + 1)
-    metadata[VERSION] = _words(frame[API], API_VERSION + 1)[API_VERSION]
+    metadata[VERSION] = _words(words[API], API_VERSION + 1)[API_VERSION]
     metadata[TRAITS] = metadata[TRAITS] & ~np.int64(0xFFFFFFFF)
-    return True
+    return False
 
 
-def register(name: str, kernel: Callable[..., Any], num_operands: int, num_results: int) -> None:
-    """Make a kernel known to XLA.
+@njit(inline="always")
+@no_type_check
+def operands(frame, count):
+    """Addresses of the buffers of a call's operands."""
+    return _words(_words(frame, FRAME_WORDS)[OPERANDS], count)
+
+
+@njit(inline="always")
+@no_type_check
+def results(frame, count):
+    """Addresses of the buffers of a call's results."""
+    return _words(_words(frame, FRAME_WORDS)[RESULTS], count)
+
+
+def register(name: str, handler: Callable[[Any], int]) -> None:
+    """Compile a handler, or load it as it was compiled before, and make it known to XLA.
 
     Args:
         name: for `jax.ffi.ffi_call`.
-        kernel: compiled by numba; takes the addresses of the operands' buffers and of the
-            results', two arrays of integers, see `vector` and the like.
-        num_operands: of the call.
-        num_results: of the call.
+        handler: function of a module, of the address of a call's frame; see `is_call`,
+            `operands` and `results`. Returns `OK`.
     """
-
-    @cfunc(types.int64(types.voidptr))
-    @no_type_check
-    def handler(frame):
-        words = carray(frame, (FRAME_WORDS,), np.int64)
-        if not _described(words):
-            kernel(_words(words[OPERANDS], num_operands), _words(words[RESULTS], num_results))
-        return 0  # No error.
-
+    function = cfunc(types.int64(types.int64), cache=True)(handler)
     capsule = ctypes.PYFUNCTYPE(ctypes.py_object, *[ctypes.c_void_p] * 3)(
         ("PyCapsule_New", ctypes.pythonapi)
     )
-    _kept.append(handler)
-    jax.ffi.register_ffi_target(name, capsule(handler.address, None, None), platform="cpu")
+    _kept.append(function)
+    jax.ffi.register_ffi_target(name, capsule(function.address, None, None), platform="cpu")
 
 
 _kept: list[Any] = []

@@ -39,7 +39,7 @@ Padded = Float[Array, "3 NHH"]
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["partner", "direction", "found_at", "allowance", "carried", "missed"],
+    data_fields=["pairs", "direction", "found_at", "allowance", "carried", "missed"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -47,16 +47,16 @@ class Contacts:
     """Who may touch whom.
 
     Attributes:
-        partner: particle ids, one on either side, a particle's own for none, shape (2, N).
-        direction: of unit length, from the partner, shape (3, 2, N).
+        pairs: particle ids, shape (2, 2 N); after the last pair 0 and 0.
+        direction: of unit length, from the second of each pair to the first, shape (3, 2 N).
         found_at: positions when they were looked up, shape (3, N), metres.
         allowance: how far each may move from there, shape (N,), metres.
         carried: 1 for a particle that lies on the table or on one that is carried, shape (N,).
         missed: contacts so far whose particles got past each other within an interval.
     """
 
-    partner: Int[Array, "2 N"]
-    direction: Float[Array, "3 2 N"]
+    pairs: Int[Array, "2 NN"]
+    direction: Float[Array, "3 NN"]
     found_at: Float[Array, "3 N"]
     allowance: Float[Array, " N"]
     carried: Float[Array, " N"]
@@ -67,8 +67,8 @@ def find_contacts(settings: SelfContact, position: Padded, missed: Int[Array, ""
     """Look up who may touch whom, with so many contacts missed before."""
     count, real = settings.apart.shape[1], position.dtype
     nobody = Contacts(
-        partner=jnp.tile(jnp.arange(count, dtype=jnp.int32), (2, 1)),
-        direction=jnp.zeros((3, 2, count), real),
+        pairs=jnp.zeros((2, 2 * count), jnp.int32),
+        direction=jnp.zeros((3, 2 * count), real),
         found_at=jnp.zeros((3, count), real),
         allowance=jnp.full(count, -1.0, real),
         carried=jnp.zeros(count, real),
@@ -137,7 +137,7 @@ def _touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
     changing = [
         position,
         velocity,
-        contacts.partner,
+        contacts.pairs,
         contacts.direction,
         contacts.found_at,
         contacts.allowance,
@@ -168,7 +168,7 @@ def _touch_jvp(
 ) -> tuple[list[Array], list[Any]]:
     """Ids, and whether contacts are looked up, count as constants."""
     result = _touch(tree, passes, *primals)
-    partner, renewed = result[2], result[-1]
+    pairs, renewed = result[2], result[-1]
 
     def smooth(leaves: list[Array]) -> tuple[Array, Array, Array]:
         settings, contacts, inverse_mass, floor, seconds, *moving = jax.tree.unflatten(tree, leaves)
@@ -180,7 +180,7 @@ def _touch_jvp(
             carried, position, velocity = resolve(
                 settings, contacts, carried, inverse_mass, floor, seconds, position, velocity
             )
-        anew = directions(settings, partner, position)
+        anew = directions(settings, pairs, position)
         direction = jnp.where(renewed, anew, contacts.direction)
         ends = ((0, 0), (halo, halo))
         return jnp.pad(position, ends), jnp.pad(velocity, ends), direction
@@ -206,23 +206,22 @@ def resolve(
     velocity: Float[Array, "3 N"],
 ) -> tuple[Float[Array, " N"], Float[Array, "3 N"], Float[Array, "3 N"]]:
     """What is carried, positions and velocities after one pass over all contacts."""
-    partner, along = contacts.partner, contacts.direction
-    listed = partner != jnp.arange(position.shape[1])[None]
+    along, (first, second) = contacts.direction, contacts.pairs
     rows = jnp.concatenate([position, velocity, inverse_mass[None], carried[None]])
-    theirs = rows[:, partner]
-    away, speed = rows[:3, None] - theirs[:3], rows[3:6, None] - theirs[3:6]
+    ours, theirs = rows[:, first], rows[:, second]
+    away, speed = ours[:3] - theirs[:3], ours[3:6] - theirs[3:6]
     distance, approach = _dot(along, away), _dot(along, speed)
     beside = _dot(away, away) - distance * distance
     gap = distance - settings.thickness
     lacking = -jnp.maximum(gap, 0.0) / seconds - approach
-    near = listed & (beside < settings.lateral**2)
+    near = (first != second) & (beside < settings.lateral**2)
     touches = near & ((gap < 0.0) | (lacking > 0.0))
     # What is carried does not give way to what lies on it: the push would be lost in the table.
     below, above = along[2] < -0.5, along[2] > 0.5
-    mine = jnp.where(touches, 1.0 - below * rows[7, None], 0.0)
+    mine = jnp.where(touches, 1.0 - below * ours[7], 0.0)
     yours = jnp.where(touches, 1.0 - above * theirs[7], 0.0)
-    shares = mine.sum(axis=0).at[partner].add(yours)
-    both = mine * (inverse_mass * shares)[None] + yours * theirs[6] * shares[partner]
+    shares = jnp.zeros_like(carried).at[first].add(mine).at[second].add(yours)
+    both = mine * ours[6] * shares[first] + yours * theirs[6] * shares[second]
     # Zero where neither can move, or nothing touches.
     per = jnp.where(both > 0.0, 1.0 / jnp.where(both > 0.0, both, 1.0), 0.0)
     impulse = per * jnp.maximum(lacking, 0.0)
@@ -232,28 +231,28 @@ def resolve(
     rub = jnp.minimum(0.5 * per, settings.friction * impulse * jax.lax.rsqrt(squared))
     push = (per * jnp.clip(-gap, 0.0, settings.thickness))[None] * along
     change = impulse[None] * along - rub[None] * sliding
-    total = jnp.concatenate([mine[None] * push, change]).sum(axis=1)
-    total = total.at[:, partner].add(-jnp.concatenate([yours[None] * push, change]))
+    total = jnp.zeros_like(rows[:6])
+    total = total.at[:, first].add(jnp.concatenate([mine[None] * push, change]))
+    total = total.at[:, second].add(-jnp.concatenate([yours[None] * push, change]))
     total = inverse_mass[None] * total
     pushed = position + total[:3]
     pushed = pushed.at[2].max(jnp.minimum(position[2], floor))
     lies = near & (gap < LEVEL * settings.thickness)
-    lying = jnp.where(lies & above, theirs[7], 0.0).max(axis=0, initial=0.0)
-    lying = lying.at[partner].max(jnp.where(lies & below, rows[7, None], 0.0))
+    lying = jnp.zeros_like(carried).at[first].max(jnp.where(lies & above, theirs[7], 0.0))
+    lying = lying.at[second].max(jnp.where(lies & below, ours[7], 0.0))
     on_table = position[2] < floor + 0.1 * settings.thickness
     carried = jnp.where(on_table, 1.0, jax.lax.stop_gradient(lying))
     return carried, pushed, velocity + total[3:]
 
 
 def directions(
-    settings: SelfContact, partner: Int[Array, "2 N"], position: Float[Array, "3 N"]
-) -> Float[Array, "3 2 N"]:
-    """Unit vectors from partners, square to both sheets or lines; any where there is none."""
-    across = _across(settings, position)
-    away = position[:, None] - position[:, partner]
+    settings: SelfContact, pairs: Int[Array, "2 NN"], position: Float[Array, "3 N"]
+) -> Float[Array, "3 NN"]:
+    """Unit vectors between pairs, square to both sheets or lines; any where there is none."""
+    across, (first, second) = _across(settings, position), pairs
     direct = _directions_of_sheets if settings.is_sheet else _directions_of_lines
-    mine = jnp.broadcast_to(across[:, None], away.shape)
-    return direct(settings.thickness, away, mine, across[:, partner])
+    away = position[:, first] - position[:, second]
+    return direct(settings.thickness, away, across[:, first], across[:, second])
 
 
 def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
@@ -265,10 +264,10 @@ def _across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array
 
 def _directions_of_sheets(
     thickness: Float[Array, ""],
-    away: Float[Array, "3 2 N"],
-    mine: Float[Array, "3 2 N"],
-    yours: Float[Array, "3 2 N"],
-) -> Float[Array, "3 2 N"]:
+    away: Float[Array, "3 NN"],
+    mine: Float[Array, "3 NN"],
+    yours: Float[Array, "3 NN"],
+) -> Float[Array, "3 NN"]:
     """Along both normals, each turned to point away from the partner.
 
     Where the partner is beside the particle and not above or below it, straight away from it.
@@ -283,10 +282,10 @@ def _directions_of_sheets(
 
 def _directions_of_lines(
     thickness: Float[Array, ""],
-    away: Float[Array, "3 2 N"],
-    mine: Float[Array, "3 2 N"],
-    yours: Float[Array, "3 2 N"],
-) -> Float[Array, "3 2 N"]:
+    away: Float[Array, "3 NN"],
+    mine: Float[Array, "3 NN"],
+    yours: Float[Array, "3 NN"],
+) -> Float[Array, "3 NN"]:
     """Square to both tangents, or straight away from the partner where that is no direction."""
     square = away - _dot(mine, away)[None] * mine
     other = yours - _dot(mine, yours)[None] * mine
