@@ -1,8 +1,9 @@
 """What a study of plans leaves behind: summary.json, figures, and a report that shows them."""
 
+import json
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +13,10 @@ from experiments.records import write_json
 from jaxsimp import viz
 from jaxsimp.planning import load_plan
 
-if TYPE_CHECKING:
-    pass
-
 Rows = list[dict[str, Any]]
+SUMMARY_FILE = "summary.json"
+TRANSFER_FILE = "transfer.json"
+"""How the plans do in MuJoCo: there once the study of transfer has replayed them."""
 LABELS = {
     "key_points": "key points",
     "all_particles": "all particles",
@@ -27,7 +28,7 @@ LABELS = {
 
 def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / "summary.json", summary)
+    write_json(folder / SUMMARY_FILE, summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     tasks = {name: study.task(name) for name in study.tasks}
@@ -46,7 +47,9 @@ def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
         goal = np.asarray(task.episode_fn(seed).goal)
         figure = viz.plot_executions(task.body, goal, plans, name)
         save_figure(figure, figures / f"plans_{name}.png")
-    (folder / "report.md").write_text(_report(study, summary))
+    replays = folder / TRANSFER_FILE
+    transfer = json.loads(replays.read_text()) if replays.exists() else []
+    (folder / "report.md").write_text(_report(study, summary, transfer))
 
 
 def _of(rows: Rows, **fields: Any) -> Rows:
@@ -76,8 +79,8 @@ def _typical_seed(rows: Rows) -> int:
     return sorted(runs, key=lambda row: _score(row))[len(runs) // 2]["seed"]
 
 
-def _score(row: dict[str, Any]) -> float:
-    return -np.inf if row["final_score"] is None else row["final_score"]
+def _score(row: dict[str, Any], column: str = "final_score") -> float:
+    return -np.inf if row[column] is None else row[column]
 
 
 def _typical_plans(rows: Rows, folder: Path) -> dict[str, tuple[np.ndarray, float]]:
@@ -89,17 +92,18 @@ def _typical_plans(rows: Rows, folder: Path) -> dict[str, tuple[np.ndarray, floa
     }
 
 
-def _report(study: Study, summary: dict[str, Any]) -> str:
+def _report(study: Study, summary: dict[str, Any], transfer: Rows) -> str:
     lines = [
         f"# Goal-conditioned model simplification: the study {study.name!r}",
         "",
         f"A plan succeeds when its settled score is at least {study.success_score}. Score 1 is "
-        f"the goal, 0 the start. {study.seeds} seeds a row; intervals are 95 % "
+        f"the goal, 0 the start; the body {_touching(study)}. "
+        f"{study.seeds} seeds a row; intervals are 95 % "
         "(Wilson for rates, Student's t in the figures).",
         "",
         *_model_table(summary["models"]),
         "",
-        *_run_table(summary["runs"]),
+        *_run_table(summary["runs"], transfer),
         "",
         "## Model error by number of key points",
         "![model errors](figures/model_errors.png)",
@@ -141,7 +145,12 @@ def _error(model: dict[str, Any]) -> float:
     return model["errors"][model["sizes"].index(len(model["key_points"]))]
 
 
-def _run_table(rows: Rows) -> list[str]:
+def _touching(study: Study) -> str:
+    return "touches itself" if study.self_contact else "passes through itself"
+
+
+def _run_table(rows: Rows, transfer: Rows) -> list[str]:
+    """Scores and rates by task and method; those in MuJoCo where they are known."""
     lines = []
     for task in dict.fromkeys(row["task"] for row in rows):
         for method, runs in _methods(_of(rows, task=task)).items():
@@ -158,6 +167,7 @@ def _run_table(rows: Rows) -> list[str]:
                     sum(run["non_finite"] for run in runs),
                     f"{np.median([run['plan_seconds'] for run in runs]):.1f}",
                     f"{sum(run['compile_seconds'] for run in runs):.1f}",
+                    *_transferred(_methods(_of(transfer, task=task)).get(method, []), transfer),
                 ]
             )
     return table(
@@ -170,6 +180,17 @@ def _run_table(rows: Rows) -> list[str]:
             "not finite",
             "seconds to plan",
             "compile seconds, all runs",
+            *(["in MuJoCo, full: median (range)"] if transfer else []),
         ],
         lines,
     )
+
+
+def _transferred(runs: Rows, transfer: Rows) -> list[str]:
+    """The cell of scores in MuJoCo; none where no plan has been replayed there."""
+    if not transfer:
+        return []
+    if not runs:
+        return ["not replayed"]
+    scores = np.array([_score(run, "mujoco_full_score") for run in runs])
+    return [f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})"]

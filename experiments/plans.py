@@ -32,8 +32,9 @@ from jaxsimp.simplify import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
 
 ACTION_SPACES = ("key_points", "all_particles")
-PLANNING = ("nominal", "robust", "self_contact")
-"""Plans are judged in the body's own physics alone, in an ensemble, or with self-contact."""
+PLANNING = ("nominal", "robust", "self_contact", "mixed")
+"""A search judges plans in the body's own physics alone, in an ensemble of them, with self-contact,
+or with self-contact where the body is a cloth, whose folds have layers."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
 PLANS_FOLDER = "plans"
@@ -104,6 +105,7 @@ class Study:
         settings: CEM settings that replace the budget's.
         num_actions: actions in a plan, instead of the budget's or the task's.
         planning: one of `PLANNING`.
+        self_contact: whether plans that were found are carried out and scored with self-contact.
     """
 
     name: str
@@ -118,7 +120,8 @@ class Study:
     budget: Literal["default", "paper", "goals", "smoke"]
     settings: dict[str, Any]
     num_actions: int | None
-    planning: Literal["nominal", "robust", "self_contact"]
+    planning: Literal["nominal", "robust", "self_contact", "mixed"]
+    self_contact: bool
 
     def __post_init__(self) -> None:
         _require_known("task", self.tasks, task_names())
@@ -144,6 +147,12 @@ class Study:
     def search_config(self, task: Task) -> CEMConfig:
         """The search settings of a task."""
         return dataclasses.replace(BUDGETS[self.budget].config(task), **self.settings)
+
+    def planning_of(self, task: Task) -> str:
+        """What judges plans of a task in the search: one of `PLANNING`, but not "mixed"."""
+        if self.planning != "mixed":
+            return self.planning
+        return "self_contact" if len(task.body.faces) else "nominal"
 
     def ensemble(self, task: Task) -> Ensemble | None:
         """The physics that plans are judged in, if it is not the body's own alone."""
@@ -212,8 +221,9 @@ def _run_all(
         planners[name] = Planner(
             task,
             study.search_config(task),
-            engine=MassSprings(self_contact=study.planning == "self_contact"),
+            engine=MassSprings(self_contact=study.planning_of(task) == "self_contact"),
             ensemble=study.ensemble(task),
+            judge=MassSprings(self_contact=study.self_contact),
         )
         seconds[name] = planners[name].estimate_seconds() * len(left[name])
         console.print(
@@ -234,7 +244,7 @@ def _run_all(
             for run in left[name]:
                 advance = partial(progress.advance, bar)
                 row = _run(planner, models[name], run, folder, advance)
-                row["planning"] = study.planning
+                row["planning"] = study.planning_of(planner.task)
                 row["success"] = (row["final_score"] or 0.0) >= study.success_score
                 row["environment"] = environment
                 row["compile_seconds"] += compile_seconds
@@ -272,6 +282,7 @@ def _run(
         "elite_cost_per_iteration": [finite(cost) for cost in found.elite_costs],
         "final_cost": finite(found.cost),
         "final_score": score,
+        "missed_contacts": execution.missed,
         "rollouts": found.num_rollouts,
         "non_finite": found.non_finite,
         "plan_seconds": plan.seconds,

@@ -2,11 +2,12 @@
 
 import dataclasses
 import inspect
+import json
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import tyro
 from rich.console import Console
@@ -60,6 +61,8 @@ class PlanOptions:
     """The best plan drawn, or the mean of the last distribution, instead of the budget's."""
     num_actions: int | None = None
     """Actions in a plan (the horizon), instead of the budget's."""
+    self_contact: bool = True
+    """Carry out and score plans that were found with the body touching itself."""
     out: Path | None = None
     """Output folder (default: results/paper, or results/paper-smoke)."""
     smoke: bool = False
@@ -93,6 +96,7 @@ class PlanOptions:
             settings=given,
             num_actions=self.num_actions,
             planning="nominal",
+            self_contact=self.self_contact,
         )
 
     def run(self, console: Console) -> None:
@@ -203,8 +207,9 @@ class TransferOptions(PlanOptions):
     """Particles that may be grasped."""
     pick_encodings: tuple[str, ...] = ("categorical",)
     """How CEM encodes what is grasped."""
-    planning: Literal["nominal", "robust", "self_contact"] = "nominal"
-    """What judges plans: the body's physics, an ensemble of them, or layers that touch, too."""
+    planning: Literal["nominal", "robust", "self_contact", "mixed"] = "mixed"
+    """What the search judges plans in: the body's physics alone, an ensemble of them, the body
+    touching itself, or the last for cloths and the first for ropes."""
     plans: Path | None = None
     """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
 
@@ -223,7 +228,7 @@ class TransferOptions(PlanOptions):
         Raises:
             ValueError: if an option has a value that it cannot have.
         """
-        if self.plans and self.planning != "nominal":
+        if self.plans and self.planning != TransferOptions.planning:
             raise ValueError(
                 f"--planning {self.planning} finds plans, and those of {self.plans} are found; "
                 f"leave one of them out"
@@ -244,8 +249,20 @@ class TransferOptions(PlanOptions):
         start = time.perf_counter()
         summary = transfer.run_study(study, folder, console)
         write_report(study, summary, folder)
+        if self.plans:
+            _add_to_report(study, summary, self.plans)
         minutes = (time.perf_counter() - start) / 60
         console.print(f"done in {minutes:.1f} minutes: {folder}/report.md")
+
+
+def _add_to_report(study: transfer.Study, summary: dict[str, Any], source: Path) -> None:
+    """Add columns of how plans transfer to the report of the study that they are from."""
+    from experiments import plan_report
+
+    records.write_json(source / plan_report.TRANSFER_FILE, summary["transfer"])
+    path = source / plan_report.SUMMARY_FILE
+    if path.exists():
+        plan_report.write_report(study.plans, json.loads(path.read_text()), source)
 
 
 Options = PlanOptions | SimplificationOptions
@@ -258,8 +275,9 @@ STUDIES: dict[str, type[Options]] = {
 
 def results_folder(options: Options) -> Path:
     """Where results go."""
-    planning = options.planning if isinstance(options, TransferOptions) else "nominal"
-    name = options.NAME + f"-{planning}" * (planning != "nominal") + "-smoke" * options.smoke
+    default = TransferOptions.planning
+    planning = options.planning if isinstance(options, TransferOptions) else default
+    name = options.NAME + f"-{planning}" * (planning != default) + "-smoke" * options.smoke
     return options.out or Path("results") / name
 
 

@@ -21,7 +21,7 @@ from experiments.scripted import SCRIPTS, scripted_plan
 from jaxsimp.dynamics import Actions
 from jaxsimp.engines.flex import VARIANTS
 from jaxsimp.engines.replay import Replay, replay
-from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
+from jaxsimp.planning import CEMConfig, Layout, MassSprings, Planner, load_plan, save_plan
 from jaxsimp.tasks import Task, score
 
 ROWS_FILE = "replays.jsonl"
@@ -133,7 +133,7 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
         if not path.exists():
             if name not in planners:
                 console.print(f"{name}: plans made by hand")
-                planners[name] = _executor(task)
+                planners[name] = _executor(task, study.plans.self_contact)
             actions = scripted_plan(task, episode)
             execution = planners[name].execute(episode, actions)
             save_plan(path, actions, execution.positions)
@@ -152,9 +152,10 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
     return cases
 
 
-def _executor(task: Task) -> Planner:
+def _executor(task: Task, self_contact: bool) -> Planner:
     """Carries out plans in our dynamics, and searches for none."""
-    return Planner(task, CEMConfig(1, 1, 1), Layout())
+    judge = MassSprings(self_contact=self_contact)
+    return Planner(task, CEMConfig(1, 1, 1), Layout(), judge=judge)
 
 
 def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console) -> None:

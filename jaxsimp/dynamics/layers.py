@@ -110,7 +110,7 @@ def make_self_contact(
             f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "
             f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s when contact "
             f"acts every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a "
-            f"smaller time step or interval, or a larger radius"
+            f"smaller time step or interval, or a larger radius; or leave self-contact out"
         )
     covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.

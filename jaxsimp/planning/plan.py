@@ -86,7 +86,8 @@ class Planner:
             layout: of the population on this machine; by default the one measured to be best.
             engine: that carries out the plans of the search; by default our own dynamics.
             ensemble: of physics that plans are costed in; by default the task's own alone.
-            judge: engine that executes the plan found; by default that of the search.
+            judge: engine that executes the plan found; by default our own dynamics, the body
+                touching itself (see `MassSprings`), or that of the search where it is another's.
 
         Raises:
             ValueError: if an engine refuses the task, or that of the search is another's and there
@@ -99,7 +100,7 @@ class Planner:
             raise ValueError(
                 f"engine is {engine}, and an ensemble is of our own dynamics; leave one of them out"
             )
-        judge = judge or engine
+        judge = judge or (MassSprings(self_contact=True) if ours else engine)
         self._cost_physics, self._physics = engine.physics(task), judge.physics(task)
         simulation = self._cost_physics[0] if ours else task.simulation()
         self.layout = layout or default_layout(config.population, simulation)

@@ -12,7 +12,6 @@ from jaxsimp import goals
 from jaxsimp.body import Body
 from jaxsimp.dynamics import (
     Actions,
-    State,
     at_rest,
     largest_time_step,
     make_pickers,
@@ -21,11 +20,19 @@ from jaxsimp.dynamics import (
     settle,
 )
 
+FARTHEST = (0.3, 0.3, 0.6)
+"""That a pick carries along x and y, either way, and up, metres."""
+SECONDS = 0.5
+"""That a pick takes."""
+TOP_SPEED = 1.5 * float(np.linalg.norm(FARTHEST)) / SECONDS
+"""Metres per second: at the middle of the longest way."""
+
 
 def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
     """A random settled state of a body, shape (N, 3): SoftGym's four random picks.
 
-    Each pick carries a random particle up to 0.3 m sideways and 0.6 m up, and drops it.
+    Each pick carries a random particle up to 0.3 m sideways and 0.6 m up, and drops it. The body
+    touches itself: parts lie on each other, and what is pulled apart need not pass through itself.
 
     Args:
         body: starts straight or flat on the table.
@@ -33,8 +40,8 @@ def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
     """
     key_pick, key_move = jax.random.split(jax.random.key(seed))
     pick = jax.random.randint(key_pick, (4, 1), 0, body.num_particles)
-    farthest = jnp.array([[[0.3, 0.3, 0.6]]])
-    nearest = jnp.array([[[-0.3, -0.3, 0.0]]])
+    farthest = jnp.array([[FARTHEST]])
+    nearest = farthest * jnp.array([[[-1.0, -1.0, 0.0]]])
     move = jax.random.uniform(key_move, (4, 1, 3), minval=nearest, maxval=farthest)
     actions = Actions(pick, move)
     return np.asarray(_drop(body)(actions))
@@ -44,17 +51,18 @@ def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
 def _drop(body: Body) -> Callable[[Actions], Float[Array, "N 3"]]:
     """Carry out one action after another on a flat body, letting it settle after each."""
     time_step = min(1e-3, 0.9 * largest_time_step(body))
-    simulation = make_simulation(body, time_step)
-    pickers = make_pickers((0.3, 0.3, 0.6), steps=round(0.5 / time_step))
+    simulation = make_simulation(body, time_step, self_contact=True, top_speed=TOP_SPEED)
+    pickers = make_pickers(FARTHEST, steps=round(SECONDS / time_step))
     settle_steps = round(1.0 / time_step)
 
     @jax.jit
     def drop(actions: Actions) -> Float[Array, "N 3"]:
-        def one(state: State, action: Actions) -> tuple[State, None]:
+        def one(position: Float[Array, "N 3"], action: Actions) -> tuple[Array, None]:
             single = jax.tree.map(lambda array: array[None], action)
-            state, _ = rollout(simulation, pickers, state, single)
-            return settle(simulation, state, settle_steps), None
+            state, _ = rollout(simulation, pickers, at_rest(position), single)
+            return settle(simulation, state, settle_steps).position, None
 
-        return jax.lax.scan(one, at_rest(goals.flat(body)), actions)[0].position
+        start = at_rest(goals.flat(body)).position
+        return jax.lax.scan(one, start, actions)[0]
 
     return drop

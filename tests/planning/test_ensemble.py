@@ -17,7 +17,16 @@ from jaxsimp.dynamics import (
     make_simulation,
     rollout,
 )
-from jaxsimp.planning import ENCODINGS, CEMConfig, Ensemble, Layout, Planner, Spread, make_ensemble
+from jaxsimp.planning import (
+    ENCODINGS,
+    CEMConfig,
+    Ensemble,
+    Layout,
+    MassSprings,
+    Planner,
+    Spread,
+    make_ensemble,
+)
 from jaxsimp.planning.ensemble import QUANTITIES, draw_factors, scaled_body
 from jaxsimp.tasks import Task, make_task
 
@@ -41,7 +50,7 @@ def ensemble() -> Ensemble:
 
 @lru_cache(None)
 def robust_planner() -> Planner:
-    return Planner(small_task(), CONFIG, LAYOUT, ensemble=ensemble())
+    return Planner(small_task(), CONFIG, LAYOUT, ensemble=ensemble(), judge=MassSprings())
 
 
 jit_rollout = jax.jit(rollout)
@@ -77,8 +86,9 @@ def costs_alone(task: Task, members: Ensemble, index: int) -> np.ndarray:
 def test_an_ensemble_of_the_body_itself_plans_bit_for_bit_as_without():
     task = small_task()
     episode, candidates = task.episode_fn(0), np.array([0, 4, 8])
-    nominal = Planner(task, CONFIG, LAYOUT)
-    one = Planner(task, CONFIG, LAYOUT, ensemble=make_ensemble(task, size=1))
+    nominal = Planner(task, CONFIG, LAYOUT, judge=MassSprings())
+    members = make_ensemble(task, size=1)
+    one = Planner(task, CONFIG, LAYOUT, ensemble=members, judge=MassSprings())
     np.testing.assert_array_equal(one.costs(episode, plans()), nominal.costs(episode, plans()))
     found, wanted = (
         made.plan(episode, candidates, ENCODINGS["categorical"], 3) for made in (one, nominal)
@@ -146,7 +156,7 @@ def test_a_member_that_is_not_finite_is_counted():
     mass = made.simulations.mass.at[1].set(jnp.nan)
     broken = dataclasses.replace(made, simulations=dataclasses.replace(made.simulations, mass=mass))
     task = small_task()
-    planner = Planner(task, CONFIG, LAYOUT, ensemble=broken)
+    planner = Planner(task, CONFIG, LAYOUT, ensemble=broken, judge=MassSprings())
     plan = planner.plan(task.episode_fn(0), np.array([0, 8]), ENCODINGS["categorical"], 0)
     assert plan.search.cost == np.inf
     assert plan.search.non_finite == 12  # two rounds of six plans
