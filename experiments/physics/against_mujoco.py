@@ -4,24 +4,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from experiments.physics.measure import Positions, hang, rms, upright
+from experiments.physics.measure import Positions, hang, rms, run, upright
 from experiments.scripted import scripted_plan
 from jaxsimp import goals
 from jaxsimp.body import Body, cloth
+from jaxsimp.dynamics import NONE, Actions, at_rest
 from jaxsimp.engines.flex import make_model
 from jaxsimp.engines.replay import replay
-from jaxsimp.planning import CEMConfig, MassSprings, Planner
-from jaxsimp.tasks import make_task
+from jaxsimp.tasks import Episode, Task, make_task, score
 from jaxsimp.viz import COLORS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
-OURS, TOUCHING, MUJOCO = "ours", "ours with self-contact", "MuJoCo, full variant"
+OURS, TOUCHING, MUJOCO = "ours", "ours with self-contact", "MuJoCo (full)"
 STYLES = {OURS: (COLORS[0], "-"), TOUCHING: (COLORS[2], "-"), MUJOCO: (COLORS[1], "--")}
 """Color and line of each engine."""
 STIFFER = 10.0
@@ -130,18 +131,32 @@ def folds(name: str, resolution: int, seed: int = 0) -> dict[str, Fold]:
     task = make_task(name, resolution)
     episode = task.episode_fn(seed)
     plan = scripted_plan(task, episode)
-    found = {}
-    for engine, touches in ((OURS, False), (TOUCHING, True)):
-        planner = Planner(task, CEMConfig(1, 1, 1), engine=MassSprings(self_contact=touches))
-        done = planner.execute(episode, plan)
-        found[engine] = done.positions[-1], done.score
+    found = {
+        OURS: carry_out(task, episode, plan, self_contact=False),
+        TOUCHING: carry_out(task, episode, plan, self_contact=True),
+    }
     (replayed,) = replay(task, [episode], [plan], "full")
-    found[MUJOCO] = replayed.positions[-1], replayed.score
+    found[MUJOCO] = replayed.positions[-1]
     start = np.asarray(episode.start, dtype=float)
     return {
-        engine: Fold(unturned(task.body, start, np.asarray(position, dtype=float)), value)
-        for engine, (position, value) in found.items()
+        engine: Fold(
+            unturned(task.body, start, position),
+            float(score(task, episode, jnp.asarray(position, dtype=float))),
+        )
+        for engine, position in found.items()
     }
+
+
+def carry_out(task: Task, episode: Episode, plan: Actions, *, self_contact: bool) -> Positions:
+    """Where a plan leaves a body in our dynamics once it has settled, metres."""
+    idle = ((0, task.settle_actions), (0, 0))
+    actions = Actions(
+        jnp.pad(plan.pick, idle, constant_values=NONE), jnp.pad(plan.displacement, (*idle, (0, 0)))
+    )
+    simulation = task.simulation(self_contact=self_contact)
+    start = at_rest(episode.start)
+    final, _ = run(simulation, task.pickers(), start, actions, adjoint=False)
+    return np.asarray(final.position, dtype=float)
 
 
 def unturned(body: Body, start: Positions, position: Positions) -> Positions:
@@ -153,10 +168,24 @@ def unturned(body: Body, start: Positions, position: Positions) -> Positions:
     return goals.turn(position, float(angle))
 
 
-def middle(body: Body, diagonal: bool) -> np.ndarray:
+def middle(body: Body, diagonal: bool) -> Int[np.ndarray, " n"]:
     """Particles along the cut square to the crease through the middle of a square cloth."""
     grid = np.arange(body.num_particles).reshape(body.shape)
     return np.diagonal(grid) if diagonal else grid[:, len(grid) // 2]
+
+
+def along_cut(
+    body: Body, cut: Int[np.ndarray, " M"], position: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, " M"]:
+    """How far positions are along the line in which a body at rest is cut, from its middle.
+
+    Args:
+        body: a cloth.
+        cut: particles of it along that line.
+        position: of these, in any unit.
+    """
+    line = body.rest[cut[-1], :2] - body.rest[cut[0], :2]
+    return position[:, :2] @ (line / np.linalg.norm(line))
 
 
 # --- the figure ----------------------------------------------------------------------------------
@@ -166,51 +195,53 @@ def plot_mujoco(quick: bool) -> "tuple[Figure, str]":
     """Hanging cloths in a row, and cuts through folds below each other."""
     import matplotlib.pyplot as plt
 
-    resolution, seconds = (9, 0.2) if quick else (25, 3.0)
+    resolution, seconds = (5, 0.1) if quick else (25, 4.0)
     body = cloth((resolution, resolution))
-    figure = plt.figure(figsize=(8.4, 6.4), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=[1.25, 1])
-    lines = _draw_hanging(upper.subplots(1, 3), body, seconds)
-    for axes, name in zip(
-        lower.subplots(2, 1), ("cloth_side_folding", "cloth_diagonal_folding"), strict=True
-    ):
+    figure = plt.figure(figsize=(8.4, 6.6), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=[2.1, 1])
+    lines = _draw_hanging(upper, body, seconds)
+    names = ("cloth_side_folding", "cloth_diagonal_folding")
+    for axes, name in zip(lower.subplots(2, 1), names, strict=True):
         lines.append(_draw_folds(axes, name, body))
     return figure, "; ".join(lines)
 
 
-def _draw_hanging(row: "np.ndarray", body: Body, seconds: float) -> list[str]:
+def _draw_hanging(figure: "SubFigure", body: Body, seconds: float) -> list[str]:
     """How the cloth hangs, an axes each way; and how far the engines are apart, in words."""
     ways, shapes = ways_to_hang(body), hung(body, seconds)
     stiff = hung(stiffened(body, STIFFER), seconds)
+    half = [1e3 * 1.08 * np.abs(way.start @ way.across).max() for way in ways.values()]
+    row = figure.subplots(1, len(ways), sharey=True, width_ratios=half)
     lines = []
-    for axes, (name, way) in zip(row, ways.items(), strict=True):
+    for axes, (name, way), width in zip(row, ways.items(), half, strict=True):
         top = way.start[way.held[0], 2]
         for engine, position in shapes[name].items():
             seen = np.stack([position @ way.across, position[:, 2] - top], axis=1)
             _draw_grid(axes, 1e3 * seen.reshape(*body.shape, 2), engine)
-        soft, hard = (rms(each[name][OURS] - each[name][MUJOCO]) for each in (shapes, stiff))
+        soft, hard = (1e3 * rms(each[name][OURS] - each[name][MUJOCO]) for each in (shapes, stiff))
         axes.set_title(
-            f"From {name}: {1e3 * soft:.2g} mm RMS\n({1e3 * hard:.2g} mm if "
-            f"{STIFFER:g} times as stiff)",
+            f"From {name}:\n{soft:.1f} mm RMS apart\n({hard:.1f} mm if {STIFFER:g} × as stiff)",
             fontsize="medium",
         )
-        axes.set(xlabel="across (mm)", aspect="equal")
-        drops = [1e3 * (top - each[:, 2].min()) for each in shapes[name].values()]
+        axes.set(xlabel="across (mm)", aspect="equal", xlim=(-width, width))
+        lowest = [1e3 * (top - each[:, 2].min()) for each in shapes[name].values()]
         lines.append(
-            f"from {name}: lowest {drops[0]:.0f} mm below in ours, {drops[1]:.0f} in MuJoCo, "
-            f"{1e3 * soft:.2g} mm RMS apart, {1e3 * hard:.2g} if {STIFFER:g} times as stiff"
+            f"from {name}: lowest {lowest[0]:.0f} mm below in ours, {lowest[1]:.0f} in MuJoCo, "
+            f"{soft:.1f} mm RMS apart, {hard:.1f} if {STIFFER:g} times as stiff"
         )
-    row[0].set_ylabel("z (mm)")
+    row[0].set_ylabel("height over what is held (mm)")
+    row[-1].legend(frameon=False, loc="lower center", ncols=2, fontsize="small")
     return lines
 
 
 def _draw_grid(axes: "Axes", seen: Float[np.ndarray, "n n 2"], engine: str) -> None:
-    """Every fourth line of a cloth's grid, its outline among them."""
+    """Some lines of a cloth's grid, its outline among them."""
     color, line = STYLES[engine]
     every = max(1, (len(seen) - 1) // 6)
     for lines in (seen[::every], seen[:, ::every].swapaxes(0, 1)):
         for points in lines:
-            axes.plot(*points.T, line, color=color, lw=0.7)
+            axes.plot(*points.T, line, color=color, lw=0.8)
+    axes.lines[-1].set_label(engine)
 
 
 def _draw_folds(axes: "Axes", name: str, body: Body) -> str:
@@ -220,15 +251,17 @@ def _draw_folds(axes: "Axes", name: str, body: Body) -> str:
     words = []
     for engine, fold in found.items():
         color, line = STYLES[engine]
-        place = fold.position[cut]
-        along = np.sign(place[:, :2] @ np.ones(2)) * np.linalg.norm(place[:, :2], axis=1)
-        label = f"{engine}: score {fold.score:.3f}"
-        axes.plot(1e3 * along, 1e3 * place[:, 2], line, color=color, marker=".", ms=3, lw=1)
-        axes.lines[-1].set_label(label)
+        place = 1e3 * fold.position[cut]
+        along = along_cut(body, cut, place)
+        label = f"{engine}: {fold.score:.3f}"
+        axes.plot(along, place[:, 2], line, color=color, marker=".", ms=4, lw=1, label=label)
         apart = 1e3 * rms(fold.position - found[MUJOCO].position)
-        words.append(f"{label}" + (f", {apart:.1f} mm RMS from MuJoCo" if apart else ""))
-    title = name.removeprefix("cloth_").replace("_", " ")
-    axes.set(ylabel="z (mm)", title=f"{title.capitalize()}, cut through the middle")
-    axes.set(aspect="equal", ylim=(0, None), xlabel="along the cut (mm)")
-    axes.legend(frameon=False, fontsize="small")
-    return f"{title}: " + ", ".join(words)
+        words.append(label + (f" ({apart:.1f} mm RMS from MuJoCo)" if engine != MUJOCO else ""))
+    title = f"{name.split('_')[1].capitalize()} fold"
+    axes.set_title(f"{title}, scores:", loc="left", fontsize="medium")
+    axes.set(xlabel="along the cut through the middle (mm)", ylabel="z (mm)", aspect="equal")
+    axes.set_ylim(0, None)
+    axes.legend(
+        frameon=False, fontsize="small", ncols=3, loc="lower right", bbox_to_anchor=(1.01, 0.95)
+    )
+    return f"{title.lower()}, scores: " + ", ".join(words)

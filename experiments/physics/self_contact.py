@@ -136,25 +136,23 @@ def plot_self_contact(quick: bool) -> "tuple[Figure, str]":
 
     resolution = 9 if quick else 25
     body = cloth((resolution, resolution))
-    figure = plt.figure(figsize=(9.6, 4.2), layout="constrained")
+    figure = plt.figure(figsize=(9.6, 3.7), layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=[1.7, 1])
-    grid = left.add_gridspec(2, 2, height_ratios=[2, 1])
-    lines, share = [], None
+    grid = left.add_gridspec(2, 2, height_ratios=[2.6, 1])
+    lines = []
     shares = right.subplots()
     for column, (touches, (name, color)) in enumerate(STYLES.items()):
         position, missed = folded_twice(resolution, self_contact=touches)
         _draw_body(left.add_subplot(grid[0, column], projection="3d"), body, position, name, color)
-        share = left.add_subplot(grid[1, column], sharex=share, sharey=share)
-        _draw_cut(share, body, position, color)
+        _draw_cut(left.add_subplot(grid[1, column]), body, position, color)
         words = _draw_distances(shares, body, position, name, color)
         lines.append(
             f"{name}: {1e3 * np.ptp(position[:, 2]):.0f} mm high, {missed} missed, {words}"
         )
-    figure.axes[1].set_ylabel("z (mm)")
     shares.axvline(LEAST, color=GOAL_COLOR, lw=1)
     shares.text(LEAST + 0.04, 0.97, f"{LEAST:.0%}", color="#666666", va="top")
-    shares.set(xlim=(0, 3), ylim=(0, 1), xlabel="distance / thickness")
-    shares.set_ylabel("share of particles closer than that")
+    shares.set(xlim=(0, 3), ylim=(0, 1), xlabel="distance to the nearest / thickness")
+    shares.set_ylabel("share of particles")
     shares.legend(frameon=False, fontsize="small", loc="lower right")
     return figure, "; ".join(lines)
 
@@ -164,8 +162,8 @@ def _draw_body(axes: "Axes3D", body: Body, position: Positions, name: str, color
     draw_body(axes, body, position, color)
     low, high = position.min(axis=0), position.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.25)
-    axes.view_init(elev=35, azim=30)
+    axes.set_box_aspect(high - low, zoom=1.05)
+    axes.view_init(elev=50, azim=-50)
     axes.set_axis_off()
     axes.set_title(name.capitalize(), fontsize="medium")
 
@@ -175,7 +173,8 @@ def _draw_cut(axes: "Axes", body: Body, position: Positions, color: str) -> None
     place = position.mean(axis=0)
     for ends in 1e3 * cut(body, position, place, np.array([0.0, 1.0, 0.0])):
         axes.plot(*ends[:, [0, 2]].T, color=color, lw=1.2, solid_capstyle="round")
-    axes.set(xlabel="along the first crease (mm)", aspect="equal")
+    axes.set(xlabel="along the first crease (mm)", ylabel="z (mm)", aspect="equal")
+    axes.set(xlim=(-35, 160), ylim=(0, 30))
 
 
 def _draw_distances(axes: "Axes", body: Body, position: Positions, name: str, color: str) -> str:
@@ -188,7 +187,7 @@ def _draw_distances(axes: "Axes", body: Body, position: Positions, name: str, co
         ("--", "triangle", nearest_triangles),
     ):
         found = measure(body, position, float(touching.adjacent)) / (2 * body.radius)
-        axes.ecdf(found, color=color, ls=line, label=f"{name}, to the nearest {what}")
+        axes.ecdf(found, color=color, ls=line, label=f"{name.split()[0]}, {what}")
         words.append(
             f"nearest {what} at least {found.min():.2f} and in the median {np.median(found):.2f} "
             f"thicknesses off, closer than {LEAST:g} for {np.mean(found < LEAST):.1%}"
