@@ -197,12 +197,14 @@ def plot_mujoco(quick: bool) -> "tuple[Figure, str]":
 
     resolution, seconds = (5, 0.1) if quick else (25, 4.0)
     body = cloth((resolution, resolution))
-    figure = plt.figure(figsize=(8.4, 6.6), layout="constrained")
-    upper, lower = figure.subfigures(2, 1, height_ratios=[2.1, 1])
-    lines = _draw_hanging(upper, body, seconds)
+    figure = plt.figure(figsize=(8.4, 7.2), layout="constrained")
+    parts = figure.add_gridspec(2, 1, height_ratios=[1.35, 1])
+    lines = _draw_hanging(figure.add_subfigure(parts[0]), body, seconds)
     names = ("cloth_side_folding", "cloth_diagonal_folding")
-    for axes, name in zip(lower.subplots(2, 1), names, strict=True):
+    rows = figure.add_subfigure(parts[1]).subplots(2, 1, sharex=True)
+    for axes, name in zip(rows, names, strict=True):
         lines.append(_draw_folds(axes, name, body))
+    rows[-1].set_xlabel("along the cut (mm)")
     return figure, "; ".join(lines)
 
 
@@ -258,10 +260,7 @@ def _draw_folds(axes: "Axes", name: str, body: Body) -> str:
         apart = 1e3 * rms(fold.position - found[MUJOCO].position)
         words.append(label + (f" ({apart:.1f} mm RMS from MuJoCo)" if engine != MUJOCO else ""))
     title = f"{name.split('_')[1].capitalize()} fold"
-    axes.set_title(f"{title}, scores:", loc="left", fontsize="medium")
-    axes.set(xlabel="along the cut through the middle (mm)", ylabel="z (mm)", aspect="equal")
-    axes.set_ylim(0, None)
-    axes.legend(
-        frameon=False, fontsize="small", ncols=3, loc="lower right", bbox_to_anchor=(1.01, 0.95)
-    )
+    axes.set_title(f"{title}, cut through the middle, and scores", fontsize="medium")
+    axes.set(ylabel="z (mm)", aspect="equal", ylim=(0, 32))
+    axes.legend(frameon=False, fontsize="small", loc="upper right")
     return f"{title.lower()}, scores: " + ", ".join(words)

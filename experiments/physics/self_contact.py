@@ -137,10 +137,10 @@ def plot_self_contact(quick: bool) -> "tuple[Figure, str]":
     resolution = 9 if quick else 25
     body = cloth((resolution, resolution))
     figure = plt.figure(figsize=(9.6, 3.7), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=[1.7, 1])
+    parts = figure.add_gridspec(1, 2, width_ratios=[1.7, 1])
+    left, shares = figure.add_subfigure(parts[0]), figure.add_subfigure(parts[1]).subplots()
     grid = left.add_gridspec(2, 2, height_ratios=[2.6, 1])
     lines = []
-    shares = right.subplots()
     for column, (touches, (name, color)) in enumerate(STYLES.items()):
         position, missed = folded_twice(resolution, self_contact=touches)
         _draw_body(left.add_subplot(grid[0, column], projection="3d"), body, position, name, color)
