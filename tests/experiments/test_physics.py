@@ -216,6 +216,7 @@ def test_distances_of_a_pair_of_layers_made_by_hand():
     # The last column is moved beyond the edge below.
     np.testing.assert_allclose(triangles[:2, :-1], 0.006, rtol=1e-12)
     np.testing.assert_allclose(triangles[:2, -1], np.hypot(0.02, 0.006), rtol=1e-12)
+    np.testing.assert_allclose(triangles[3, :-1], np.hypot(0.05, 0.006), rtol=1e-12)
     np.testing.assert_allclose(particles[3], np.sqrt(0.05**2 + 0.02**2 + 0.006**2), rtol=1e-12)
 
 
