@@ -200,8 +200,8 @@ def plot_mujoco(quick: bool) -> "tuple[Figure, str]":
     figure = plt.figure(figsize=(8.4, 7.2), layout="constrained")
     parts = figure.add_gridspec(2, 1, height_ratios=[1.35, 1])
     lines = _draw_hanging(figure.add_subfigure(parts[0]), body, seconds)
-    names = ("cloth_side_folding", "cloth_diagonal_folding")
-    rows = figure.add_subfigure(parts[1]).subplots(2, 1, sharex=True)
+    names = ("cloth_side_folding", "cloth_diagonal_folding")[: 1 if quick else 2]
+    rows = figure.add_subfigure(parts[1]).subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for axes, name in zip(rows, names, strict=True):
         lines.append(_draw_folds(axes, name, body))
     rows[-1].set_xlabel("along the cut (mm)")
