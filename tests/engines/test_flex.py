@@ -213,6 +213,19 @@ def test_a_hanging_sheet_stretches_as_the_closed_form():
     assert found == pytest.approx(expected, rel=0.06)
 
 
+@pytest.mark.parametrize("ratio", [1.01, 1.5, 2.0])
+def test_a_stretched_sheet_pulls_as_saint_venants_and_kirchhoffs_material(ratio):
+    body = cloth((5, 5))
+    model = make_model(body, "full", table=False)
+    data = mujoco.MjData(model)
+    data.qpos[:] = (body.rest * [ratio - 1, 0, 0]).ravel()
+    mujoco.mj_forward(model, data)
+    pull = -data.qfrc_spring.reshape(-1, 3)[-5:, 0].sum() / 0.3
+    # Of Green's strain along the grid, with no strain across it.
+    stiffness = flex.stretch_stiffness(body, body.stiffness) / (1 - flex.POISSON**2)
+    assert pull == pytest.approx(stiffness * (ratio**2 - 1) / 2 * ratio, rel=1e-9)
+
+
 def test_the_fast_variant_hardly_stretches():
     # A rope whose springs would be stretched by half by its own weight.
     body = rope(9, 0.2, stretch_stiffness=10.0, bend_stiffness=0.0, drag=20.0)

@@ -1,0 +1,1 @@
+"""Figures of docs/physics.md: `python -m experiments.physics`."""

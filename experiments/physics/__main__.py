@@ -1,0 +1,86 @@
+"""Make the figures of docs/physics.md: `python -m experiments.physics`; with `--help`, options."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+from rich.console import Console
+
+from experiments.physics import against_mujoco, resolution, self_contact, swings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FIGURES: "dict[str, Callable[[bool], tuple[Figure, str]]]" = {
+    "time_step": swings.plot_time_step,
+    "resolution": resolution.plot_resolution,
+    "energy": swings.plot_energy,
+    "mujoco": against_mujoco.plot_mujoco,
+    "self_contact": self_contact.plot_self_contact,
+}
+"""What is drawn, by the name of the figure; each comes with a line of its numbers."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Figures of the physics page: convergence, energy, MuJoCo beside ours, and self-contact."""
+
+    out: Path = Path("docs/figures")
+    """Folder of the figures, made where it is not there."""
+    quick: bool = False
+    """Smaller bodies and shorter motions: for tests."""
+    only: tuple[str, ...] = ()
+    """Names of the figures that are made; all by default."""
+
+    def check(self) -> None:
+        """Refuse what cannot be done, before anything is run.
+
+        Raises:
+            ValueError: if there is no such figure, or the folder is a file.
+        """
+        unknown = [name for name in self.only if name not in FIGURES]
+        if unknown:
+            raise ValueError(f"unknown figure {unknown[0]!r}; choose from {', '.join(FIGURES)}")
+        if self.out.exists() and not self.out.is_dir():
+            raise ValueError(f"{self.out} is a file; give a folder with --out")
+
+
+def main() -> int:
+    """Run the command line; the exit status is 0, or 2 for a wrong request."""
+    options = tyro.cli(Options, prog="python -m experiments.physics", description=Options.__doc__)
+    try:
+        options.check()
+    except ValueError as error:
+        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
+        return 2
+    save_figures(options)
+    return 0
+
+
+def save_figures(options: Options) -> None:
+    """Write the figures, and print their numbers."""
+    import matplotlib.pyplot as plt
+
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in options.only or FIGURES:
+        figure, numbers = FIGURES[name](options.quick)
+        save_small(figure, options.out / f"physics_{name}.png")
+        plt.close(figure)
+        print(f"{name}: {numbers}", flush=True)
+
+
+def save_small(figure: "Figure", path: Path) -> None:
+    """Write a figure as PNG of at most 128 colors: a third of the size of one of all colors."""
+    from PIL import Image
+
+    figure.savefig(path, dpi=110)
+    with Image.open(path) as picture:
+        few = picture.convert("RGB").quantize(128)
+    few.save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,49 @@
+"""What figures share: rollouts, cloths that hang at rest, and how far shapes are apart."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsimp.body import Body
+from jaxsimp.dynamics import at_rest, largest_time_step, make_simulation, rollout
+from jaxsimp.dynamics.step import Motion, pack, unpack
+from jaxsimp.dynamics.steps import plain_steps
+
+GRAVITY = 9.81
+Positions = Float[np.ndarray, "N 3"]
+
+run = jax.jit(rollout, static_argnames=("observe", "adjoint"))
+
+
+def hang(body: Body, start: Positions, held: Sequence[int], seconds: float) -> Positions:
+    """Where a body is that hung from some of its particles for a while, metres.
+
+    Args:
+        body: that hangs, and passes through itself.
+        start: at rest there, off the table, metres.
+        held: particles that stay where they are.
+        seconds: that it hangs.
+    """
+    time_step = min(2e-3, 0.9 * largest_time_step(body))
+    simulation = make_simulation(body, time_step, GRAVITY)
+    motion = Motion(jnp.asarray(np.isin(np.arange(len(start)), held)), jnp.zeros((3, len(start))))
+    shares = jnp.zeros(round(seconds / time_step))
+    final = _steps(simulation, pack(simulation, at_rest(start)), motion, shares)
+    return np.asarray(unpack(simulation, final).position, dtype=float)
+
+
+_steps = jax.jit(plain_steps)
+
+
+def upright(body: Body, height: float = 1.0) -> Positions:
+    """A cloth at rest in a plane across the table, its last row the upper edge, metres."""
+    x, y = body.rest.T[:2]
+    return np.stack([0 * x, y, height + x], axis=1)
+
+
+def rms(difference: Float[np.ndarray, "*T N 3"]) -> float:
+    """Root-mean-square length of differences, in their unit."""
+    return float(np.sqrt((difference**2).sum(axis=-1).mean()))
