@@ -27,7 +27,7 @@
 # %%
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -198,23 +198,86 @@ for name, (body, material, picked, others) in cases.items():
 # bending that MuJoCo's rope has not, and the air's drag near its 2 and 3 per second. (Factors of
 # stiffness go from the softest kind of spring to the stiffest: bend, then stretch; bend, shear,
 # stretch.)
+
+# %% [markdown]
+# ## How far it carries
 #
-# Two things come out less well. Errors grow with time, faster for the cloth, so the longer the
-# motion, the less there is to be gained. And a cloth that hangs from two *opposite* corners folds
-# along the line between them, where a sheet of finite elements and a grid of springs are different
-# things.
+# Harder motions of the cloth: half as long again, and from two *opposite* corners. All of them
+# once more with other random moves, for one seed says little.
 
 # %%
 body, material, _, others = cases["cloth"]
-harder = {
-    "cloth, half as long again": motions(body, material, others, 1, num_actions * 3 // 2),
-    "cloth, opposite corners": motions(body, material, [[a, d], [b, c]], 2),
-}
-if SMALL:
-    harder = {}
+
+
+def positions(recordings):
+    """Where particles were seen, shape (R, T, N, 3), metres."""
+    return np.stack([recording.positions for recording in recordings])
+
+
+def rms(missed):
+    """Root-mean-square distance, mm, of each pair of recordings, shape (R / 2,)."""
+    return 1e3 * np.sqrt((missed**2).sum(axis=-1).reshape(len(missed) // 2, -1).mean(axis=1))
+
+
+def kinds_of_motion(body, material):
+    """By kind, recordings that were not seen: two of each seed."""
+    corners = [[a, d], [b, c]]
+    kinds = {
+        "other edges": (others, [1, 3, 4, 5], num_actions),
+        "half as long again": (others, [1, 3, 4, 5], num_actions * 3 // 2),
+        "opposite corners": (corners, [2, 4, 5, 6], num_actions),
+    }
+    return {
+        name: [
+            recording
+            for seed in seeds[: 1 if SMALL else None]
+            for recording in motions(body, material, picked, seed, count)
+        ]
+        for name, (picked, seeds, count) in kinds.items()
+    }
+
+
+harder = kinds_of_motion(body, material)
 for name, recordings in harder.items():
-    before, after = (1e3 * error for error in replay_errors("cloth", recordings))
-    print(f"{name}: before {before:.1f} mm, after {after:.1f} mm: 1/{before / after:.1f}")
+    before, after = (
+        rms(
+            replay(each, recordings, action_seconds, longest_time_step=longest)
+            - positions(recordings)
+        )
+        for each in (body, found["cloth"].body)
+    )
+    print(f"{name}, by seed: before {before.round(1)} mm, after {after.round(1)} mm")
+    print(f"  1/{(before / after).round(1)}")
+
+# %% [markdown]
+# From the other edges the error falls 5- to 7-fold, over longer motions 4- to 5-fold, and from
+# opposite corners 2- to 3-fold only. It is the model that sets that limit, not the descent: fitted
+# to *the very motions* from opposite corners (of the first seed), our cloth misses them by nearly
+# as much as when it had not seen them.
+#
+# What the model lacks shows where MuJoCo's sheet is compared with itself. It cuts each cell into
+# two triangles, all of them along the same diagonal. Cut along the other, with all else the same,
+# it swings from opposite corners farther from itself than our fitted cloth does: at this
+# resolution such a motion is one of the mesh, and our cells, with a spring along either diagonal,
+# are neither mesh. Bending matters less there. Longer motions are sensitive to everything: 2 % of
+# stiffness are then several millimetres.
+
+# %%
+if not SMALL:
+    itself = calibrate(body, harder["opposite corners"][:2], action_seconds, config)
+    print(f"fitted to opposite corners themselves: {1e3 * itself.errors.min():.1f} mm")
+
+flip = np.arange(side**2).reshape(side, side)[:, ::-1].ravel()
+changes = {
+    "cut along the other diagonal": (replace(body, faces=flip[body.faces][:, ::-1]), material),
+    "without bending": (body, Material(material.settings.replace("both", "stretch"), 3.0)),
+    "2 % stiffer": (body, Material(material.settings.replace("3000", "3060"), 3.0)),
+}
+for label, (changed, other) in changes.items():
+    print(f"MuJoCo's sheet {label}, from itself:")
+    for name, recordings in kinds_of_motion(changed, other).items():
+        apart = rms(positions(recordings) - positions(harder[name]))
+        print(f"  {name}, by seed: {apart.round(1)} mm")
 
 # %% [markdown]
 # ## Before and after, on motions that were not seen
@@ -249,7 +312,8 @@ for (left, middle_axes, right), (name, (body, *_)) in zip(rows, cases.items(), s
 plt.show()
 
 # %% [markdown]
-# The check: on motions that the calibration has not seen, the error falls at least 5-fold.
+# The check: on motions that the calibration has not seen (the rope's, and the cloth's of the first
+# seed from its other edges), the error falls at least 5-fold.
 
 # %%
 for name, (before, after) in errors.items():
