@@ -162,7 +162,7 @@ def test_a_plan_scores_the_same_in_both_engines():
     task, candidates = small_task(), np.array([0, 5, 10])
     config = CEMConfig(num_iterations=2, population=8, initial_populations=2)
     planners = {
-        type(engine): Planner(task, config, Layout(2, 2), engine)
+        type(engine): Planner(task, config, Layout(2, 2), engine, judge=engine)
         for engine in (MassSprings(), MJX())
     }
     episode, encoding = task.episode_fn(0), ENCODINGS["categorical"]
