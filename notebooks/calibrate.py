@@ -326,8 +326,8 @@ for (left, middle_axes, right), (name, (body, *_)) in zip(rows, cases.items(), s
 plt.show()
 
 # %% [markdown]
-# The check: on motions that the calibration has not seen (the rope's, and the cloth's from its other
-# edges, with each seed), the error falls at least 5-fold.
+# The check: on motions that the calibration has not seen (the rope's, and the cloth's from its
+# other edges, with each seed), the error falls at least 5-fold.
 
 # %%
 for name, (before, after) in errors.items():
