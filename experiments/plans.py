@@ -146,9 +146,10 @@ class Study:
         return dataclasses.replace(task, num_actions=num_actions, limits=limits)
 
     def search_config(self, task: Task) -> CEMConfig:
-        """The search settings of a task: half the budget's rounds with self-contact, which takes five times as long."""
+        """The search settings of a task."""
         config = BUDGETS[self.budget].config(task)
         if self.planning_of(task) == "self_contact":
+            # A round takes some five times as long.
             rounds = ceil(config.num_iterations / 2)
             config = dataclasses.replace(config, num_iterations=rounds)
         return dataclasses.replace(config, **self.settings)
