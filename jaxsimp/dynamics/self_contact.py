@@ -1,10 +1,10 @@
 """Self-contact: layers of a body rest on each other, and rub.
 
 A particle of a sheet stands for a disc in the sheet's plane, one of a rope for a piece of its
-line. Each touches at most one other on either side: the nearest that is not its neighbour in the
-body. A contact keeps the direction that it was found with, from one particle to the other and
-square to both sheets or lines, until all are looked up again. That is when one has moved farther
-than its distance from what it does not touch allows.
+line. It touches the nearest on either side that is not its neighbour in the body, and those whose
+nearest it is; each such pair is listed once. A contact keeps the direction that it was found with,
+from one particle to the other and square to both sheets or lines, until all are looked up again.
+That is when one has moved farther than its distance from what it does not touch allows.
 
 Contact acts every `interval` time steps on velocities, as impulses that are inelastic and look
 ahead (nobody approaches faster than would close the gap within the interval), with Coulomb
