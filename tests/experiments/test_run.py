@@ -115,6 +115,23 @@ def test_plans_load_and_end_in_the_score_of_their_run(folder):
 
 
 @pytest.mark.slow
+def test_plans_are_scored_with_self_contact_unless_told_otherwise(folder, tmp_path):
+    with_it = [row for row in finished(folder)["runs"] if row["task"] == TASKS[1]]
+    options = (*OPTIONS, "--tasks", TASKS[1], "--no-self-contact")
+    assert command(*options, "--out", tmp_path / "without") == 0
+    without = finished(tmp_path / "without")["runs"]
+    assert {type(row["missed_contacts"]) for row in with_it} == {int}
+    assert {row["missed_contacts"] for row in without} == {None}
+    # The search is the same.
+    assert [row["final_cost"] for row in without] == [row["final_cost"] for row in with_it]
+    for path, words in (
+        (folder, "touches itself"),
+        (tmp_path / "without", "passes through itself"),
+    ):
+        assert words in (path / "report.md").read_text()
+
+
+@pytest.mark.slow
 def test_figures_and_report_are_there(folder):
     figures = {"model_errors", "models", "costs", *(f"plans_{name}" for name in TASKS)}
     report = (folder / "report.md").read_text()
