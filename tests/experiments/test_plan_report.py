@@ -62,7 +62,7 @@ def test_the_plan_shown_is_the_median_one_of_the_first_method():
 def test_run_table_summarises_each_method():
     rows = [row(seed, score) for seed, score in enumerate([0.95, 0.2, 0.91])]
     rows += [row(0, None, "all_particles", non_finite=8, cost_per_iteration=[None, None])]
-    table = plan_report._run_table(rows)
+    table = plan_report._run_table(rows, [])
     assert len(table) == 4
     first = [cell.strip() for cell in table[2].strip("|").split("|")]
     assert first[:3] == ["t", "key points, categorical", "0.910 (0.200 to 0.950)"]
@@ -71,6 +71,11 @@ def test_run_table_summarises_each_method():
     failed = [cell.strip() for cell in table[3].strip("|").split("|")]
     assert failed[3].startswith("0/1 (")
     assert failed[5] == "8"
+    # Two of them have been replayed in MuJoCo.
+    replayed = [rows[seed] | {"mujoco_full_score": score} for seed, score in [(0, 0.5), (2, 0.7)]]
+    table = plan_report._run_table(rows, replayed)
+    cells = [line.strip("|").split("|")[-1].strip() for line in table[2:]]
+    assert cells == ["0.600 (0.500 to 0.700)", "not replayed"]
 
 
 def test_costs_have_a_row_a_run_and_nothing_finite_is_not_a_number():
