@@ -61,6 +61,9 @@ class PlanOptions:
     """The best plan drawn, or the mean of the last distribution, instead of the budget's."""
     num_actions: int | None = None
     """Actions in a plan (the horizon), instead of the budget's."""
+    planning: Literal["nominal", "robust", "self_contact", "mixed"] = "nominal"
+    """What the search judges plans in: the body's physics alone, an ensemble of them, the body
+    touching itself, or the last for cloths and the first for ropes."""
     self_contact: bool = True
     """Carry out and score plans that were found with the body touching itself."""
     out: Path | None = None
@@ -95,7 +98,7 @@ class PlanOptions:
             budget="smoke" if self.smoke else self.budget,
             settings=given,
             num_actions=self.num_actions,
-            planning="nominal",
+            planning=self.planning,
             self_contact=self.self_contact,
         )
 
@@ -213,15 +216,6 @@ class TransferOptions(PlanOptions):
     plans: Path | None = None
     """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
 
-    def configuration(self) -> Study:
-        """The study of the plans that are found.
-
-        Raises:
-            ValueError: if an option has a value that it cannot have.
-        """
-        study = super().configuration()
-        return dataclasses.replace(study, planning=self.planning)
-
     def transfer(self) -> transfer.Study:
         """The study that these options ask for.
 
@@ -275,9 +269,10 @@ STUDIES: dict[str, type[Options]] = {
 
 def results_folder(options: Options) -> Path:
     """Where results go."""
-    default = TransferOptions.planning
-    planning = options.planning if isinstance(options, TransferOptions) else default
-    name = options.NAME + f"-{planning}" * (planning != default) + "-smoke" * options.smoke
+    name = options.NAME
+    if isinstance(options, PlanOptions) and options.planning != type(options).planning:
+        name += f"-{options.planning}"
+    name += "-smoke" * options.smoke
     return options.out or Path("results") / name
 
 

@@ -334,6 +334,13 @@ def test_the_paper_budget_is_the_authors():
         assert not config.keep_best
 
 
+def test_studies_that_plan_otherwise_have_another_folder():
+    for planning, name in (("nominal", "goals"), ("mixed", "goals-mixed")):
+        options = run.GoalsOptions(planning=planning)
+        assert run.results_folder(options).name == name
+        assert options.configuration().planning == planning
+
+
 def test_a_smoke_run_is_small():
     study = run.PaperOptions(smoke=True).configuration()
     assert study.seeds == 2
