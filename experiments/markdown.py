@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -15,6 +17,11 @@ def table(header: Iterable[str], rows: Iterable[Iterable[object]]) -> list[str]:
         "| " + " | ".join(map(str, cells)) + " |"
         for cells in [header, ["---"] * len(header), *rows]
     ]
+
+
+def spread(scores: np.ndarray) -> str:
+    """Median and range, in words."""
+    return f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})"
 
 
 def success_interval(successes: int, count: int) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.markdown import provenance, save_figure, success_interval, table
+from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER, ROWS_FILE, Study, key_points
 from experiments.records import write_json
 from jaxsimp import viz
@@ -161,7 +161,7 @@ def _run_table(rows: Rows, transfer: Rows) -> list[str]:
                 [
                     task,
                     method,
-                    f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})",
+                    spread(scores),
                     f"{successes}/{len(runs)} ({low:.2f} to {high:.2f})",
                     runs[0]["rollouts"],
                     sum(run["non_finite"] for run in runs),
@@ -193,4 +193,4 @@ def _transferred(runs: Rows, transfer: Rows) -> list[str]:
     if not runs:
         return ["not replayed"]
     scores = np.array([_score(run, "mujoco_full_score") for run in runs])
-    return [f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})"]
+    return [spread(scores)]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.markdown import provenance, save_figure, success_interval, table
+from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER
 from experiments.records import write_json
 from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, Study, replay_path
@@ -132,13 +132,9 @@ def _table(rows: Rows, success_score: float) -> list[str]:
         runs = _of(rows, task=task, action_space=space, planning=planning)
         scores = [np.array([_score(run, column) for run in runs]) for column in ENGINES.values()]
         warned = sum(bool(run["warnings"]) for run in runs)
-        cells = [*map(_spread, scores), *(_rate(each, success_score) for each in scores), warned]
+        cells = [*map(spread, scores), *(_rate(each, success_score) for each in scores), warned]
         lines.append([task, LABELS[space], planning, *cells])
     return table([*header, "warned"], lines)
-
-
-def _spread(scores: np.ndarray) -> str:
-    return f"{np.median(scores):.3f} ({scores.min():.3f} to {scores.max():.3f})"
 
 
 def _rate(scores: np.ndarray, success_score: float) -> str:

@@ -7,13 +7,12 @@ here matters: where the buffers of operands and results are, and how large.
 
 import ctypes
 from collections.abc import Callable
-from typing import (
-    Any,
-    no_type_check,
-)  # numba needs the functions as they are, not wrapped in checks
+from typing import Any, no_type_check  # numba needs functions as they are, not wrapped in checks
 
 import jax
 import numpy as np
+
+# numba has no annotations, and mypy does not see the names that it gathers at import.
 from numba import carray, cfunc, njit, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
