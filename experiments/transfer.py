@@ -133,7 +133,7 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
         if not path.exists():
             if name not in planners:
                 console.print(f"{name}: plans made by hand")
-                planners[name] = _executor(task, study.plans.self_contact)
+                planners[name] = executor(task, study.plans.self_contact)
             actions = scripted_plan(task, episode)
             execution = planners[name].execute(episode, actions)
             save_plan(path, actions, execution.positions)
@@ -152,7 +152,7 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
     return cases
 
 
-def _executor(task: Task, self_contact: bool) -> Planner:
+def executor(task: Task, self_contact: bool) -> Planner:
     """Carries out plans in our dynamics, and searches for none."""
     judge = MassSprings(self_contact=self_contact)
     return Planner(task, CEMConfig(1, 1, 1), Layout(), judge=judge)

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.physics.measure import Positions, hang, rms, run, upright
+from experiments.physics.measure import Positions, hang, rms, upright
 from experiments.scripted import scripted_plan
+from experiments.transfer import executor
 from jaxsimp import goals
 from jaxsimp.body import Body, cloth
-from jaxsimp.dynamics import NONE, Actions, at_rest
+from jaxsimp.dynamics import Actions
 from jaxsimp.engines.flex import make_model
 from jaxsimp.engines.replay import replay
 from jaxsimp.tasks import Episode, Task, make_task, score
@@ -149,14 +150,8 @@ def folds(name: str, resolution: int, seed: int = 0) -> dict[str, Fold]:
 
 def carry_out(task: Task, episode: Episode, plan: Actions, *, self_contact: bool) -> Positions:
     """Where a plan leaves a body in our dynamics once it has settled, metres."""
-    idle = ((0, task.settle_actions), (0, 0))
-    actions = Actions(
-        jnp.pad(plan.pick, idle, constant_values=NONE), jnp.pad(plan.displacement, (*idle, (0, 0)))
-    )
-    simulation = task.simulation(self_contact=self_contact)
-    start = at_rest(episode.start)
-    final, _ = run(simulation, task.pickers(), start, actions, adjoint=False)
-    return np.asarray(final.position, dtype=float)
+    done = executor(task, self_contact).execute(episode, plan)
+    return done.positions[-1].astype(float)
 
 
 def unturned(body: Body, start: Positions, position: Positions) -> Positions:
