@@ -96,15 +96,45 @@ def _rows(array, halo):
 @compiled
 @no_type_check
 def _gone_too_far(position, found_at, allowance):
-    far = False
+    """Whether any has, from where it was found, or from there moved along with the others.
+
+    What all have in common brings none nearer to another. Where some move and some lie still,
+    half of it is common to all.
+    """
+    zero = allowance.dtype.type(0)
+    if not _any_beyond(position, found_at, allowance, zero, zero, zero):
+        return False
+    x, y, z = (
+        _middle_of_moves(position[0], found_at[0]),
+        _middle_of_moves(position[1], found_at[1]),
+        _middle_of_moves(position[2], found_at[2]),
+    )
+    return _any_beyond(position, found_at, allowance, x, y, z)
+
+
+@njit(inline="always")
+@no_type_check
+def _any_beyond(position, found_at, allowance, common_x, common_y, common_z):
+    beyond = False
     for i in range(len(allowance)):
         x, y, z = (
-            position[0][i] - found_at[0, i],
-            position[1][i] - found_at[1, i],
-            position[2][i] - found_at[2, i],
+            position[0][i] - found_at[0, i] - common_x,
+            position[1][i] - found_at[1, i] - common_y,
+            position[2][i] - found_at[2, i] - common_z,
         )
-        far |= not x * x + y * y + z * z <= allowance[i] * abs(allowance[i])
-    return far
+        beyond |= not x * x + y * y + z * z <= allowance[i] * abs(allowance[i])
+    return beyond
+
+
+@njit(inline="always")
+@no_type_check
+def _middle_of_moves(position, found_at):
+    """Half way between the least and the greatest, along an axis."""
+    least = greatest = position[0] - found_at[0]
+    for i in range(1, len(position)):
+        move = position[i] - found_at[i]
+        least, greatest = min(least, move), max(greatest, move)
+    return (least + greatest) / 2
 
 
 @compiled
@@ -158,7 +188,7 @@ def _resolve(position, velocity, pairs, direction, carried, inverse_mass, number
         for i in range(count):
             carried[i] = one if pz[i] < table else lying[i]
         if num_touching == 0:
-            continue
+            break
         total[:] = zero
         for each in range(num_touching):
             place = np.uint32(each)

@@ -151,6 +151,44 @@ def test_what_has_flown_apart_or_is_not_a_number_is_looked_up_all_the_same(body)
             assert len(found & others) > 0.9 * len(others)
 
 
+@pytest.mark.parametrize(
+    ("common", "own", "again"),
+    [(0, 0.9, False), (0, 1.1, True), (50, 0.9, False), (50, 1.1, True)],
+)
+def test_contacts_are_looked_up_again_when_one_moves_too_far_among_the_others(common, own, again):
+    """In allowances: all move by the one, and one back and another forth by the other."""
+    body = cloth((9, 9), (0.1, 0.1))
+    settings = make_self_contact(body, 1e-3)
+    position = jnp.asarray(crumpled(body, 2, 0.1))
+    contacts = find_contacts(settings, position, jnp.zeros((), jnp.int32))
+    moved = np.asarray(position).copy()
+    allowance = np.asarray(contacts.allowance)
+    first, second = np.argsort(allowance)[:2]  # Both may move as far as the first.
+    move = allowance[first] * np.array([0.6, 0.0, -0.8])
+    moved += common * move[:, None]
+    moved[:, first] += own * move
+    moved[:, second] -= own * move
+    nothing, zero = jnp.zeros(body.num_particles), jnp.zeros(())
+    after, *_ = touch(
+        settings, contacts, nothing, zero, zero, jnp.asarray(moved), 0 * position, passes=0
+    )
+    assert np.any(after.found_at != contacts.found_at) == again
+
+
+def test_contacts_last_twice_as_long_where_some_move_and_some_lie_still():
+    body = cloth((9, 9), (0.1, 0.1))
+    settings = make_self_contact(body, 1e-3)
+    position = jnp.asarray(10 * goals.flat(body).T, jnp.float32)  # No pair is near: all may
+    contacts = find_contacts(settings, position, jnp.zeros((), jnp.int32))  # move equally far.
+    allowance = float(contacts.allowance[0])
+    assert np.all(contacts.allowance == allowance)
+    for share, again in ((1.9, False), (2.1, True)):
+        moved = position.at[1, ::2].add(share * allowance)
+        nothing, zero = jnp.zeros(body.num_particles), jnp.zeros(())
+        after, *_ = touch(settings, contacts, nothing, zero, zero, moved, 0 * moved, passes=0)
+        assert np.any(after.found_at != contacts.found_at) == again
+
+
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("body", [cloth((9, 9), (0.1, 0.1)), rope(60, 0.3)])
 @pytest.mark.parametrize("seed", range(5))
