@@ -98,6 +98,20 @@ def test_the_score_is_the_tasks_of_the_settled_positions(task):
     assert abs(idle.score) < 0.01
 
 
+@pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
+def test_a_body_settles_until_it_is_still_and_no_longer(task, monkeypatch):
+    lifted = plan({0: [0.05, 0.0, 0.1]}, {0: [0.05, 0.0, 0.0]})
+    soon, late = (
+        one(dataclasses.replace(task, settle_actions=count), lifted).positions[-1]
+        for count in (4, 8)
+    )
+    np.testing.assert_array_equal(soon, late)
+    monkeypatch.setattr("jaxsimp.engines.replay.STILL", 0.0)
+    fully = one(dataclasses.replace(task, settle_actions=4), lifted).positions[-1]
+    # At STILL it could move 5 mm in what is left of those seconds; it only creeps: 0.4 mm.
+    assert 0 < np.abs(fully - soon).max() < 1e-3
+
+
 @pytest.mark.slow
 def test_a_dragged_rope_moves_as_ours():
     # Dragged along the table by one end, sideways: what is compared depends on mass, friction,
