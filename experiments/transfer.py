@@ -28,8 +28,6 @@ ROWS_FILE = "replays.jsonl"
 REPLAYS_FOLDER = "replays"
 SCRIPTED = "scripted"
 """The action space of plans that were made by hand."""
-CHUNK = 8
-"""Plans replayed at a time, a row on disk after each; it changes no result."""
 SCRIPTED_SEEDS = 3
 """Seeds of the plans made by hand: a fold starts flat, and differs by how it is turned."""
 
@@ -174,24 +172,22 @@ def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console)
         for name in study.plans.tasks:
             task = study.plans.task(name)
             of_task = [case for case in left if case.row["task"] == name]
-            for first in range(0, len(of_task), CHUNK):
-                for row in _replay_chunk(task, of_task[first : first + CHUNK], folder):
-                    records.append_row(folder / ROWS_FILE, row)
-                    progress.advance(bar)
+            for row in _replay_task(task, of_task, folder):
+                records.append_row(folder / ROWS_FILE, row)
+                progress.advance(bar)
 
 
-def _replay_chunk(task: Task, cases: list[Case], folder: Path) -> list[dict[str, Any]]:
-    """Replay a few plans in every variant, save the motions, and return the rows."""
+def _replay_task(task: Task, cases: list[Case], folder: Path) -> Iterator[dict[str, Any]]:
+    """Replay plans in every variant, save each one's motions, and return its row."""
     episodes = [task.episode_fn(case.row["seed"]) for case in cases]
-    actions = [load_plan(case.path)[0] for case in cases]
-    found = {name: replay(task, episodes, actions, name) for name in VARIANTS}
-    rows = []
-    for index, case in enumerate(cases):
-        replays = {name: results[index] for name, results in found.items()}
+    plans = [load_plan(case.path)[0] for case in cases]
+    # All variants at once: no core waits for the last plan of one.
+    found = [replay(task, episodes, plans, name) for name in VARIANTS]
+    for case, actions, *results in zip(cases, plans, *found, strict=True):
+        replays = dict(zip(VARIANTS, results, strict=True))
         for name, result in replays.items():
-            _save(folder, case, name, actions[index], result)
-        rows.append(case.row | _fields(replays))
-    return rows
+            _save(folder, case, name, actions, result)
+        yield case.row | _fields(replays)
 
 
 def _fields(replays: dict[str, Replay]) -> dict[str, Any]:

@@ -257,7 +257,7 @@ def _find(position, pairs, direction, found_at, allowance, numbers, frame, apart
     clear = np.full(count, farthest, real)
     nearest = np.full((count, 2), reach * reach, real)
     best = np.empty((count, 2), np.uint32)
-    points = np.full((6, count + LANES), real(FAR))
+    points = np.full((6, count + LANES), real(np.nan))  # After the last: near to nothing.
     for place in range(count):
         i = order[place]
         best[i, 0] = best[i, 1] = i

@@ -6,7 +6,7 @@ along the displacement. Plans run side by side on all cores, each in its own `mu
 plan's result does not depend on the others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from enum import IntEnum
@@ -73,8 +73,11 @@ def replay(
     variant: str | Variant = "full",
     *,
     num_workers: int | None = None,
-) -> list[Replay]:
+) -> Iterator[Replay]:
     """Carry out plans in MuJoCo, let the body settle, and score them.
+
+    Results come one by one, in the order of the plans; the first is begun when it is asked for,
+    and the others beside it.
 
     Args:
         task: what is asked; its body, limits and times are used.
@@ -93,9 +96,18 @@ def replay(
         )
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
     model = make_model(task.body, variant, picked)
-    score_fn = jax.jit(partial(score, task))
-    with ThreadPoolExecutor(num_workers or num_cores()) as pool:
-        return list(pool.map(partial(_replay_one, task, model, score_fn), episodes, plans))
+    one = partial(_replay_one, task, model, jax.jit(partial(score, task)))
+    return _side_by_side(one, episodes, plans, num_workers or num_cores())
+
+
+def _side_by_side(
+    one: Callable[[Episode, Actions], Replay],
+    episodes: Sequence[Episode],
+    plans: Sequence[Actions],
+    num_workers: int,
+) -> Iterator[Replay]:
+    with ThreadPoolExecutor(num_workers) as pool:
+        yield from pool.map(one, episodes, plans)
 
 
 def _replay_one(

@@ -134,8 +134,8 @@ def test_a_batch_is_its_plans_one_by_one_bit_for_bit(variant):
     seeds = [0, 1, 2, 0]
     plans = [random_plan(task, seed) for seed in seeds]
     episodes = [task.episode_fn(seed) for seed in seeds]
-    together = replay(task, episodes, plans, variant, num_workers=3)
-    again = replay(task, episodes, plans, variant, num_workers=1)
+    together = list(replay(task, episodes, plans, variant, num_workers=3))
+    again = list(replay(task, episodes, plans, variant, num_workers=1))
     for index, found in enumerate(together):
         # Alone, other particles can be grasped: the model is another, its numbers are not.
         (alone,) = replay(task, episodes[index : index + 1], plans[index : index + 1], variant)
