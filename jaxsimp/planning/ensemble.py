@@ -116,6 +116,7 @@ def make_ensemble(
     seed: int = 0,
     spread: Spread | None = None,
     *,
+    self_contact: bool = False,
     statistic: Literal["mean", "worst"] = "mean",
     caution: float = 0.0,
 ) -> Ensemble:
@@ -131,12 +132,14 @@ def make_ensemble(
         size: number of members, `E`.
         seed: of the factors.
         spread: of the factors.
+        self_contact: whether the body touches itself, in every member.
         statistic: see `Ensemble`.
         caution: see `Ensemble`.
 
     Raises:
         ValueError: if the size is below 1, or members so different are stable only at a time
-            step below the task's by more than `MOST_REFINEMENT`; see also `Ensemble`.
+            step below the task's by more than `MOST_REFINEMENT`; see also `Ensemble`, and
+            `Task.simulation` for self-contact.
     """
     if size < 1:
         raise ValueError(f"size is {size}; an ensemble has at least 1 member")
@@ -152,7 +155,9 @@ def make_ensemble(
             f"{task.time_step:.3g} s; give a smaller spread of stiffness, damping or mass"
         )
     stepped = [
-        dataclasses.replace(member, longest_time_step=step * each).simulation()
+        dataclasses.replace(member, longest_time_step=step * each).simulation(
+            self_contact=self_contact
+        )
         for member, each in zip(members, durations, strict=True)
     ]
     return Ensemble(

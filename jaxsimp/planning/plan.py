@@ -96,13 +96,16 @@ class Planner:
         self.task, self.config, self.ensemble = task, config, ensemble
         engine = engine or MassSprings()
         ours = isinstance(engine, MassSprings)
-        if ensemble is not None and not ours:
+        if ensemble is not None and engine != MassSprings():
             raise ValueError(
-                f"engine is {engine}, and an ensemble is of our own dynamics; leave one of them out"
+                f"engine is {engine}, and an ensemble is of our own dynamics, with self-contact if "
+                f"it was made so; leave one of them out"
             )
         judge = judge or (MassSprings(self_contact=True) if ours else engine)
         self._cost_physics, self._physics = engine.physics(task), judge.physics(task)
         simulation = self._cost_physics[0] if ours else task.simulation()
+        if ensemble is not None:
+            simulation = jax.tree.map(lambda leaf: leaf[0], ensemble.simulations)
         self.layout = layout or default_layout(config.population, simulation)
         cost_fn: Callable[..., Array] = partial(_plan_cost, task, engine)
         if ensemble is not None:

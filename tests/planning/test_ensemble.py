@@ -98,6 +98,23 @@ def test_an_ensemble_of_the_body_itself_plans_bit_for_bit_as_without():
     assert dataclasses.astuple(found.search)[1:] == dataclasses.astuple(wanted.search)[1:]
 
 
+def test_members_touch_themselves_where_asked_to():
+    task = dataclasses.replace(make_task("rope_folding", 9), num_actions=2)
+    episode, pick, move = task.episode_fn(0), np.full((6, 2, 2), NONE), np.zeros((6, 2, 2, 3))
+    pick[:, :, 0] = 0  # One end is carried over, and laid on the rope.
+    move[:, :, 0] = [[0.14, 0.0, 0.08], [0.14, 0.0, -0.08]]
+    move[:, 1, 0, 0] -= np.linspace(0.0, 0.1, 6)
+    folds = Actions(jnp.asarray(pick), jnp.asarray(move, dtype=float))
+
+    def costs(**physics) -> np.ndarray:
+        return Planner(task, CONFIG, LAYOUT, judge=MassSprings(), **physics).costs(episode, folds)
+
+    touching, passing = (make_ensemble(task, 1, self_contact=touches) for touches in (True, False))
+    found = costs(ensemble=touching)
+    np.testing.assert_array_equal(found, costs(engine=MassSprings(self_contact=True)))
+    assert (np.abs(costs(ensemble=passing) - found) > 0.01 * found).any()
+
+
 def test_costs_are_the_mean_of_those_in_each_member_alone():
     task = small_task()
     episode = task.episode_fn(0)
@@ -170,8 +187,9 @@ def test_an_ensemble_of_another_engine_is_refused():
         def rollout(self, physics, state, actions, observe):
             return state, observe(state)
 
-    with pytest.raises(ValueError, match="leave one of them out"):
-        Planner(small_task(), CONFIG, LAYOUT, Other(), ensemble())
+    for engine in (Other(), MassSprings(self_contact=True)):
+        with pytest.raises(ValueError, match="leave one of them out"):
+            Planner(small_task(), CONFIG, LAYOUT, engine, ensemble())
 
 
 # --- members -------------------------------------------------------------------------------------
