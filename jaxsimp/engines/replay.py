@@ -32,7 +32,7 @@ FASTEST = 100.0
 """Metres per second along an axis: no picker, spring or fall makes a particle this fast."""
 STILL, STILL_SECONDS = 5e-3, 0.1
 """A body has settled when no particle was faster than this along an axis, metres per second, for
-so long. A folded cloth then moves on by less than 0.4 mm, as its contacts creep."""
+so long. A folded cloth then creeps on, by some 0.4 mm in the rest of the task's time."""
 
 
 class ReplayStatus(IntEnum):
@@ -170,7 +170,7 @@ class _Scene:
 
     def settle(self, num_actions: int) -> None:
         """Let the time of some actions pass with nothing held, or less where all comes to rest."""
-        enough, still = round(STILL_SECONDS / self._model.opt.timestep), 0
+        enough, still = max(1, round(STILL_SECONDS / self._model.opt.timestep)), 0
         for _ in range(num_actions * self._steps):
             self._step()
             still = still + 1 if np.abs(self._data.qvel).max() < STILL else 0
