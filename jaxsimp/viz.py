@@ -213,6 +213,7 @@ def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> N
 
 def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -> None:
     """A model over its goal, into 3-D axes."""
+    axes.computed_zorder = False  # Key points lie in the goal: depth would hide some.
     draw_body(axes, body, goal, GOAL_COLOR)
     closed = model.elements[:, [*range(model.elements.shape[1]), 0]]
     for element in closed if model.elements.shape[1] > 2 else model.elements:
