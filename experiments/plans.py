@@ -149,7 +149,7 @@ class Study:
         """The search settings of a task."""
         config = BUDGETS[self.budget].config(task)
         if self.planning_of(task) == "self_contact":
-            # A round takes some five times as long.
+            # A round takes some four times as long.
             rounds = ceil(config.num_iterations / 2)
             config = dataclasses.replace(config, num_iterations=rounds)
         return dataclasses.replace(config, **self.settings)

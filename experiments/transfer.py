@@ -172,7 +172,7 @@ def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console)
         for name in study.plans.tasks:
             task = study.plans.task(name)
             of_task = [case for case in left if case.row["task"] == name]
-            for row in _replay_task(task, of_task, folder):
+            for row in _replay_task(task, of_task, folder) if of_task else ():
                 records.append_row(folder / ROWS_FILE, row)
                 progress.advance(bar)
 

@@ -90,8 +90,8 @@ class Planner:
                 touching itself (see `MassSprings`), or that of the search where it is another's.
 
         Raises:
-            ValueError: if an engine refuses the task, or that of the search is another's and there
-                is an ensemble.
+            ValueError: if an engine refuses the task, or there is an ensemble, and an engine of the
+                search that is not our own dynamics without self-contact.
         """
         self.task, self.config, self.ensemble = task, config, ensemble
         engine = engine or MassSprings()
