@@ -301,7 +301,7 @@ def _find(position, pairs, direction, found_at, allowance, numbers, frame, apart
                             _compare(
                                 j, i, -x, -y, -z, squared, across, is_sheet, numbers, nearest, best
                             )
-    stretch, length = sqrt(real(1) + squash), 0
+    stretch = sqrt(real(1) + squash)
     for i in range(count):
         closest = sqrt(min(nearest[i, 0], nearest[i, 1]))
         # What is beside a particle may come nearer by its distance, what is above by less.
@@ -309,10 +309,19 @@ def _find(position, pairs, direction, found_at, allowance, numbers, frame, apart
         allowance[i] = max(slack, half * free)
         for axis in range(3):
             found_at[axis, i] = position[axis][i]
+    _list_pairs(position, best, across, pairs, direction, thickness, level, is_sheet)
+
+
+@compiled
+@no_type_check
+def _list_pairs(position, best, across, pairs, direction, thickness, level, is_sheet):
+    """List each particle and its nearest on a side, each pair once, with its direction."""
+    length = 0
+    for i in range(len(best)):
         above, below = best[i, 0], best[i, 1]
         for k in range(2):
             j = best[i, k]
-            # Each pair once: not those that have been met from the other side.
+            # Not those that have been met from the other side.
             met = j < i and (best[j, 0] == i or best[j, 1] == i)
             if j != i and not met and not (k == 1 and below == above):
                 pairs[0, length], pairs[1, length] = i, j
