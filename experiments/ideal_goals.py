@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from jaxsimp.body import Body
+from jaxsimp.bodies import Body
 from jaxsimp.goals import Positions
-from jaxsimp.simplify.keypoints import KeyPoints
+from jaxsimp.simplification.key_points import KeyPoints
 
 
 class Line(NamedTuple):
@@ -31,7 +31,7 @@ class Line(NamedTuple):
     height: float = 1.0
 
 
-class Fold(NamedTuple):
+class IdealFold(NamedTuple):
     """A fold of a rectangular cloth.
 
     Attributes:
@@ -46,20 +46,20 @@ class Fold(NamedTuple):
 CORNERS = ((-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0))
 THIRD = 1 / 3
 FOLDS = {
-    "flat": Fold((), ()),
-    "side, x": Fold((Line((0, 0), (0, 1)),), ((0, -1), (0, 1))),
-    "side, y": Fold((Line((0, 0), (1, 0)),), ((-1, 0), (1, 0))),
-    "diagonal": Fold((Line((0, 0), (1, 1)),), ()),
-    "other diagonal": Fold((Line((0, 0), (1, -1)),), ()),
-    "letter": Fold(
+    "flat": IdealFold((), ()),
+    "side, x": IdealFold((Line((0, 0), (0, 1)),), ((0, -1), (0, 1))),
+    "side, y": IdealFold((Line((0, 0), (1, 0)),), ((-1, 0), (1, 0))),
+    "diagonal": IdealFold((Line((0, 0), (1, 1)),), ()),
+    "other diagonal": IdealFold((Line((0, 0), (1, -1)),), ()),
+    "letter": IdealFold(
         (Line((-THIRD, 0), (0, 1)), Line((THIRD, 0), (0, -1), height=1.5)),
         ((-THIRD, -1), (-THIRD, 1), (THIRD, -1), (THIRD, 1)),
     ),
-    "quarter": Fold(
+    "quarter": IdealFold(
         (Line((0, 0), (0, 1)), Line((0, 0), (1, 0), height=2.0)),
         ((0, -1), (0, 1), (0, 0), (-1, 0), (1, 0)),
     ),
-    "four corners": Fold(
+    "four corners": IdealFold(
         (
             Line((1, 0), (1, -1)),
             Line((0, 1), (1, 1)),
@@ -68,10 +68,10 @@ FOLDS = {
         ),
         ((1, 0), (0, 1), (-1, 0), (0, -1)),
     ),
-    "side, off centre": Fold((Line((-0.3, 0), (0, 1)),), ((-0.3, -1), (-0.3, 1))),
-    "corner": Fold((Line((1, 0.2), (0.8, -0.8)),), ((1, 0.2), (0.2, 1))),
-    "diagonal, off centre": Fold((Line((1, -0.3), (1, -1)),), ((1, -0.3), (-0.3, 1))),
-    "through a corner": Fold((Line((-1, -1), (2, 0.8)),), ((1, -0.2),)),
+    "side, off centre": IdealFold((Line((-0.3, 0), (0, 1)),), ((-0.3, -1), (-0.3, 1))),
+    "corner": IdealFold((Line((1, 0.2), (0.8, -0.8)),), ((1, 0.2), (0.2, 1))),
+    "diagonal, off centre": IdealFold((Line((1, -0.3), (1, -1)),), ((1, -0.3), (-0.3, 1))),
+    "through a corner": IdealFold((Line((-1, -1), (2, 0.8)),), ((1, -0.2),)),
 }
 
 

@@ -18,18 +18,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from experiments import records
-from jaxsimp.planning import (
-    ENCODINGS,
-    CEMConfig,
-    Ensemble,
-    MassSprings,
-    Planner,
-    Spread,
-    make_ensemble,
-    save_plan,
-)
-from jaxsimp.simplify import METHODS, KeyPoints, simplify
+from jaxsimp import records
+from jaxsimp.engines import Ensemble, MassSprings, Spread, make_ensemble
+from jaxsimp.planning import ENCODINGS, CEMConfig, Planner, save_plan
+from jaxsimp.simplification import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
 
 ACTION_SPACES = ("key_points", "all_particles")

@@ -12,9 +12,10 @@ from typing import Any, ClassVar, Literal
 import tyro
 from rich.console import Console
 
-from experiments import records, simplification, transfer
+from experiments import simplification, transfer
 from experiments.plans import ACTION_SPACES, Study, run_study
 from experiments.simplification import available_methods
+from jaxsimp import records
 from jaxsimp.planning import ENCODINGS
 from jaxsimp.tasks import make_task, task_names
 

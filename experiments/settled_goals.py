@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from experiments.ideal_goals import IdealGoal, ideal_goal, partial_folds
 from jaxsimp import goals
-from jaxsimp.body import Body
+from jaxsimp.bodies import Body
 from jaxsimp.dynamics import (
     NONE,
     Actions,

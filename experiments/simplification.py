@@ -16,7 +16,6 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from experiments import records
 from experiments.ideal_goals import (
     FOLDS,
     LINES,
@@ -28,8 +27,9 @@ from experiments.ideal_goals import (
     is_right,
 )
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
-from jaxsimp.body import Body, cloth, rope
-from jaxsimp.simplify import METHODS, simplify_batch
+from jaxsimp import records
+from jaxsimp.bodies import Body, cloth, rope
+from jaxsimp.simplification import METHODS, simplify_batch
 
 ROWS_FILE = "goals.jsonl"
 ROPE_LENGTH = 1.0

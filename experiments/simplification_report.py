@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.markdown import provenance, save_figure, success_interval, table
-from experiments.records import write_json
 from experiments.simplification import ROWS_FILE, Case, Study
 from jaxsimp import viz
-from jaxsimp.simplify import KeyPoints, simplify_batch
+from jaxsimp.records import write_json
+from jaxsimp.simplification import KeyPoints, simplify_batch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

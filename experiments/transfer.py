@@ -1,6 +1,6 @@
 """The study of transfer: plans found in our dynamics, carried out in MuJoCo.
 
-Each plan is replayed in both variants of `jaxsimp.engines.flex`. Plans that were scripted by hand
+Each plan is replayed in both variants of `jaxsimp.engines.mujoco`. Plans that were scripted by hand
 are scored in all three, too: where those transfer and those that were found do not, the search
 has exploited our dynamics; where neither does, the engines differ.
 """
@@ -16,12 +16,14 @@ import jax.numpy as jnp
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from experiments import plans, records
+from experiments import plans
 from experiments.scripted import SCRIPTS, scripted_plan
+from jaxsimp import records
 from jaxsimp.dynamics import Actions
-from jaxsimp.engines.flex import VARIANTS
-from jaxsimp.engines.replay import Replay, replay
-from jaxsimp.planning import CEMConfig, Layout, MassSprings, Planner, load_plan, save_plan
+from jaxsimp.engines import MassSprings
+from jaxsimp.engines.mujoco.execution import Replay, replay
+from jaxsimp.engines.mujoco.model import VARIANTS
+from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
 from jaxsimp.tasks import Task, score
 
 ROWS_FILE = "replays.jsonl"

@@ -7,11 +7,11 @@ import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER
-from experiments.records import write_json
 from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, Study, replay_path
 from jaxsimp import viz
-from jaxsimp.engines.flex import VARIANTS
+from jaxsimp.engines.mujoco.model import VARIANTS
 from jaxsimp.planning import load_plan
+from jaxsimp.records import write_json
 
 Rows = list[dict[str, Any]]
 ENGINES = {

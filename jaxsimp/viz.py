@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsimp.body import Body
-from jaxsimp.meshes import boundary_edges
-from jaxsimp.simplify import KeyPoints, Status
+from jaxsimp.bodies import Body
+from jaxsimp.bodies.meshes import boundary_edges
+from jaxsimp.simplification import FitStatus, KeyPoints
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -224,7 +224,7 @@ def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -
 
 def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
     """A model's error by number of key points, with the tolerance and the number chosen."""
-    chosen = "chosen" if model.status == Status.FITS else "none fits, last tried"
+    chosen = "chosen" if model.status == FitStatus.FITS else "none fits, last tried"
     axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
     axes.axhline(model.tolerance * 1e3, color=GOAL_COLOR, ls="--", label="tolerance")
     axes.plot(

@@ -16,7 +16,7 @@
 #
 # A plan is only as good as the physics that it was found in. Here the physics is another engine's:
 # a rope and a cloth are simulated by [MuJoCo](https://mujoco.org) as *flexes*, with stiffness and
-# damping that we pretend not to know. `jaxsimp.dynamics.calibrate` sees how they swing while a
+# damping that we pretend not to know. `jaxsimp.calibration` sees how they swing while a
 # picker carries one particle about, and scales our stiffness, damping and drag, by gradient descent
 # through our dynamics, until our rope and our cloth swing alike. Other motions, not seen by it,
 # then show whether it has learnt the physics or just the recording.
@@ -35,16 +35,15 @@ import mujoco
 import numpy as np
 
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth, rope
-from jaxsimp.dynamics import (
-    Actions,
+from jaxsimp.bodies import Body, cloth, rope
+from jaxsimp.calibration import (
     CalibrationConfig,
     Recording,
-    at_rest,
     calibrate,
-    replay,
-    replay_error,
+    recording_error,
+    simulate_recordings,
 )
+from jaxsimp.dynamics import Actions, at_rest
 
 SMALL = os.environ.get("JAXSIMP_NOTEBOOK_SIZE") == "small"  # the size that the tests run
 num_actions, steps = 8, 80 if SMALL else 150
@@ -189,7 +188,8 @@ def replay_errors(name, recordings):
     """RMS errors (m) of the first guess and of what was found."""
     bodies = cases[name][0], found[name].body
     return [
-        replay_error(body, recordings, action_seconds, longest_time_step=longest) for body in bodies
+        recording_error(body, recordings, action_seconds, longest_time_step=longest)
+        for body in bodies
     ]
 
 
@@ -253,7 +253,7 @@ harder, reduced = kinds_of_motion(body, material), {}
 for name, recordings in harder.items():
     before, after = (
         rms(
-            replay(each, recordings, action_seconds, longest_time_step=longest)
+            simulate_recordings(each, recordings, action_seconds, longest_time_step=longest)
             - positions(recordings)
         )
         for each in (body, found["cloth"].body)
@@ -305,7 +305,9 @@ for (left, middle_axes, right), (name, (body, *_)) in zip(rows, cases.items(), s
     wanted = np.stack([recording.positions for recording in unseen[name]])
     moments = action_seconds * np.arange(1, num_actions + 1)
     for label, each, style in [("before", body, "C1"), ("after", found[name].body, "C0")]:
-        replayed = replay(each, unseen[name], action_seconds, longest_time_step=longest)
+        replayed = simulate_recordings(
+            each, unseen[name], action_seconds, longest_time_step=longest
+        )
         missed = replayed - wanted
         by_moment = np.sqrt((missed**2).sum(axis=-1).mean(axis=(0, 2)))
         middle_axes.plot(moments, 1e3 * by_moment, style, label=label)
@@ -319,7 +321,9 @@ for (left, middle_axes, right), (name, (body, *_)) in zip(rows, cases.items(), s
     points = wanted[0, -1, shown]
     right.plot(*1e3 * points[:, [axis, 2]].T, "k--", label="MuJoCo")
     for label, each, style in [("before", body, "C1"), ("after", found[name].body, "C0")]:
-        replayed = replay(each, unseen[name][:1], action_seconds, longest_time_step=longest)
+        replayed = simulate_recordings(
+            each, unseen[name][:1], action_seconds, longest_time_step=longest
+        )
         right.plot(*1e3 * replayed[0, -1, shown][:, [axis, 2]].T, style, label=label)
     right.set(xlabel=f"{'xy'[axis]} (mm)", ylabel="z (mm)", title=f"{name}: last moment, cut")
     right.legend(frameon=False)

@@ -36,7 +36,7 @@ import numpy as np
 import optax
 
 from jaxsimp import goals
-from jaxsimp.body import rope
+from jaxsimp.bodies import rope
 from jaxsimp.dynamics import (
     NONE,
     Actions,

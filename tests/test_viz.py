@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from jaxsimp import goals, viz
-from jaxsimp.body import cloth, from_mesh, rope
-from jaxsimp.garments import skirt
-from jaxsimp.simplify import KeyPoints, Status
+from jaxsimp.bodies import cloth, from_mesh, rope
+from jaxsimp.bodies.garments import skirt
+from jaxsimp.simplification import FitStatus, KeyPoints
 
 
 @pytest.fixture(autouse=True)
@@ -105,7 +105,7 @@ def test_models_are_drawn_over_their_goals():
 
 def test_simplifications_have_a_row_each_with_errors_beside_the_model():
     flat, line = cloth((5, 5)), rope(9)
-    none = replace(rope_model(), status=Status.NO_FIT, errors=(np.inf, 0.2))
+    none = replace(rope_model(), status=FitStatus.NO_FIT, errors=(np.inf, 0.2))
     figure = viz.plot_simplifications(
         {
             "my_$file$": (flat, goals.flat(flat), cloth_model()),

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from experiments import records
 from experiments.benchmark import contact, planning, rollouts
 from experiments.benchmark.measure import FULL, QUICK, Row, Scale
+from jaxsimp import records
 
 SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
     "step": rollouts.step,

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from experiments.benchmark.measure import Prepared, Row, prepare
-from experiments.engines import ENGINES, edge_list
-from experiments.engines.workload import Workload, make_body, make_workload
+from experiments.benchmark.peers import ENGINES, edge_list
+from experiments.benchmark.peers.workload import Workload, make_body, make_workload
 
 TOLERANCE = 1e-5
 """Largest error of a position after 100 steps, metres.

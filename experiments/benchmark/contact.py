@@ -19,7 +19,7 @@ from experiments.benchmark.measure import (
     time_in_turns,
 )
 from jaxsimp import goals
-from jaxsimp.body import cloth
+from jaxsimp.bodies import cloth
 from jaxsimp.dynamics import NONE, Actions, at_rest, largest_time_step, make_pickers, rollout
 from jaxsimp.dynamics.simulation import make_simulation
 from jaxsimp.planning import Layout, PopulationMap

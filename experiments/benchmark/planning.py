@@ -22,12 +22,12 @@ from experiments.benchmark.measure import (
     prepare,
     time_in_turns,
 )
-from experiments.engines.workload import num_cores
-from jaxsimp.body import rope
+from jaxsimp.bodies import rope
+from jaxsimp.machine import num_cores
 from jaxsimp.planning import ENCODINGS, CEMConfig, Plan, Planner
-from jaxsimp.simplify import qp, simplify
-from jaxsimp.simplify.rope_fit import Limits, fit_within
-from jaxsimp.simplify.rope_uniform import fit_rope, interpolation_matrix, uniform_breakpoints
+from jaxsimp.simplification import qp, simplify
+from jaxsimp.simplification.ropes.fit import Limits, fit_within
+from jaxsimp.simplification.ropes.uniform import fit_rope, interpolation_matrix, uniform_breakpoints
 from jaxsimp.tasks import make_task
 
 PLANNED_STEPS = (4, 150)

@@ -20,16 +20,16 @@ from experiments.benchmark.measure import (
     prepare,
     time_in_turns,
 )
-from experiments.engines import ENGINES, population_map
-from experiments.engines.population_map import Physics, final_position, physics, plans
-from experiments.engines.workload import (
+from experiments.benchmark.peers import ENGINES, population_map
+from experiments.benchmark.peers.population_map import Physics, final_position, physics, plans
+from experiments.benchmark.peers.workload import (
     UnavailableError,
     Workload,
     make_body,
     make_workload,
-    num_cores,
 )
 from jaxsimp.dynamics import Actions, at_rest, settle
+from jaxsimp.machine import num_cores
 from jaxsimp.planning import Layout, PopulationMap, default_layout
 
 SWEPT_POPULATION, SWEPT_HORIZON = 64, 2

@@ -12,10 +12,10 @@ from experiments.physics.measure import Positions, hang, rms, upright
 from experiments.scripted import scripted_plan
 from experiments.transfer import executor
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth
+from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions
-from jaxsimp.engines.flex import make_model
-from jaxsimp.engines.replay import replay
+from jaxsimp.engines.mujoco.execution import replay
+from jaxsimp.engines.mujoco.model import make_model
 from jaxsimp.tasks import Episode, Task, make_task, score
 from jaxsimp.viz import COLORS
 

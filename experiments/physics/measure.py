@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxsimp.body import Body
+from jaxsimp.bodies import Body
 from jaxsimp.dynamics import at_rest, largest_time_step, make_simulation, rollout
+from jaxsimp.dynamics.adjoint import plain_steps
 from jaxsimp.dynamics.step import Motion, pack, unpack
-from jaxsimp.dynamics.steps import plain_steps
 
 GRAVITY = 9.81
 Positions = Float[np.ndarray, "N 3"]

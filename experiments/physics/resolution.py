@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.physics.measure import hang, rms, run, upright
 from jaxsimp import goals
-from jaxsimp.body import cloth
+from jaxsimp.bodies import cloth
 from jaxsimp.dynamics import (
     NONE,
     Actions,

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from experiments.physics.measure import Positions, run
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth
+from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import (
     NONE,
     Actions,

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from experiments.physics.measure import GRAVITY, rms, run
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth, rope
+from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.dynamics import (
     Actions,
     State,

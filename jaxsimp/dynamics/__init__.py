@@ -1,13 +1,5 @@
 """Differentiable mass-spring dynamics: a body and actions become motion."""
 
-from jaxsimp.dynamics.calibrate import (
-    Calibration,
-    CalibrationConfig,
-    Recording,
-    calibrate,
-    replay,
-    replay_error,
-)
 from jaxsimp.dynamics.pickers import NONE, Actions, Pickers, make_pickers
 from jaxsimp.dynamics.rollout import rollout, settle
 from jaxsimp.dynamics.simulation import (
@@ -21,19 +13,13 @@ from jaxsimp.dynamics.simulation import (
 __all__ = [
     "NONE",
     "Actions",
-    "Calibration",
-    "CalibrationConfig",
     "Pickers",
-    "Recording",
     "Simulation",
     "State",
     "at_rest",
-    "calibrate",
     "largest_time_step",
     "make_pickers",
     "make_simulation",
-    "replay",
-    "replay_error",
     "rollout",
     "settle",
 ]

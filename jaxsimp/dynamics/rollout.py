@@ -1,7 +1,7 @@
 """Rollouts: semi-implicit Euler steps of a simulation under actions, as `jax.lax.scan`.
 
 Pure functions of arrays: `jit`, `vmap` and `grad` apply. Gradients are taken by the adjoint of
-steps.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`.
+adjoint.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`.
 """
 
 from collections.abc import Callable
@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from jaxsimp.dynamics.adjoint import plain_steps, steps
+from jaxsimp.dynamics.contact.stepping import Moving, begin, end, touching_steps
 from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, speed_profile
 from jaxsimp.dynamics.simulation import Simulation, State
 from jaxsimp.dynamics.step import Motion, unpack
-from jaxsimp.dynamics.steps import plain_steps, steps
-from jaxsimp.dynamics.touching import Moving, begin, end, touching_steps
 
 
 def rollout(
@@ -35,7 +35,7 @@ def rollout(
         state: at the start, shapes (N, 3).
         actions: shapes (T, G) and (T, G, 3).
         observe: applied to the state at the end of each action.
-        adjoint: differentiate by the adjoint of steps.py, in reverse mode only; False leaves
+        adjoint: differentiate by the adjoint of adjoint.py, in reverse mode only; False leaves
             differentiation to JAX: in either mode, but reverse takes many times as long.
 
     Returns:

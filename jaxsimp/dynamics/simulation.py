@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsimp.body import Body
-from jaxsimp.dynamics.layers import TOP_SPEED, SelfContact, make_self_contact
+from jaxsimp.bodies import Body
+from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_contact
 from jaxsimp.dynamics.springs import Springs, make_springs
 
 

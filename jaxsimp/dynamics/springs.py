@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsimp.body import Body
+from jaxsimp.bodies import Body
 
 MOST_OFFSETS = 16
 """Bodies with more distinct offsets are stored by neighbour."""

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsimp.dynamics.contact import table_contact
+from jaxsimp.dynamics.contact.table import table_contact
 from jaxsimp.dynamics.simulation import Simulation, State
 from jaxsimp.dynamics.springs import (
     over_batch,

@@ -1,24 +1,7 @@
-"""Physics engines that we did not write. MuJoCo is imported when one is first asked for."""
+"""Engines: what carries out plans. Our springs, ensembles of them, MJX, and MuJoCo."""
 
-from jaxsimp.engines.mjx import (
-    MJX,
-    MJXSimulation,
-    make_mjx_simulation,
-    mjx_accelerations,
-    mjx_rollout,
-    mjx_trajectory,
-)
-from jaxsimp.engines.oracle import Disagreement, compare_with_mjx
-from jaxsimp.engines.tendons import tendon_spec
+from jaxsimp.engines.engine import Engine, Observe
+from jaxsimp.engines.ensemble import Ensemble, Spread, make_ensemble
+from jaxsimp.engines.springs import MassSprings
 
-__all__ = [
-    "MJX",
-    "Disagreement",
-    "MJXSimulation",
-    "compare_with_mjx",
-    "make_mjx_simulation",
-    "mjx_accelerations",
-    "mjx_rollout",
-    "mjx_trajectory",
-    "tendon_spec",
-]
+__all__ = ["Engine", "Ensemble", "MassSprings", "Observe", "Spread", "make_ensemble"]

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.body import Body
+from jaxsimp.bodies import Body
 from jaxsimp.goals.shapes import Positions
 
 NOISE = 0.03

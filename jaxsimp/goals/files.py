@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsimp.body import Body, from_mesh, rope_along
+from jaxsimp.bodies import Body, from_mesh, rope_along
+from jaxsimp.bodies.meshes import load_mesh, read_mesh
 from jaxsimp.goals.check import check_goal
 from jaxsimp.goals.flatten import flatten
 from jaxsimp.goals.shapes import Positions
-from jaxsimp.meshes import load_mesh, read_mesh
 
 
 def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positions]:
@@ -54,7 +54,7 @@ def load_body(path: str | Path) -> Body:
 
     An `.npz` file holds `rest`, shape (N, 3), or (N, 2) for a flat body, metres, and `faces`,
     shape (F, 3), of a sheet; without `faces` it is a rope. Any other file is a mesh at rest
-    (OBJ, PLY, STL, OFF, GLB, ...), in metres; it is cleaned (see `jaxsimp.meshes.clean_mesh`).
+    (OBJ, PLY, STL, OFF, GLB, ...), in metres; it is cleaned (see `jaxsimp.bodies.clean_mesh`).
 
     Args:
         path: of the file.

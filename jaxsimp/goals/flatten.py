@@ -11,8 +11,8 @@ loss, its scale lowered in stages).
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsimp.bodies.meshes import LARGEST, WELD, Faces, half_edges
 from jaxsimp.goals.shapes import Positions
-from jaxsimp.meshes import LARGEST, WELD, Faces, half_edges
 
 SCALES = (1.0, 0.3, 0.1)
 """Misfit at which an edge begins to count less, relative to the median edge: one a stage."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsimp.body import Body
-from jaxsimp.garments import Garment
+from jaxsimp.bodies import Body
+from jaxsimp.bodies.garments import Garment
+from jaxsimp.bodies.meshes import boundary_edges, half_edges
 from jaxsimp.goals.shapes import Positions, flat
-from jaxsimp.meshes import boundary_edges, half_edges
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxsimp.body import Body
+from jaxsimp.bodies import Body
 
 Positions = Float[np.ndarray, "N 3"]
 

@@ -1,6 +1,7 @@
 """Planning: a task and the particles that may be grasped become a plan."""
 
-from jaxsimp.planning.actions import (
+from jaxsimp.planning.cem import CEMConfig, Search, search
+from jaxsimp.planning.encodings import (
     ENCODINGS,
     ActionSpace,
     Categorical,
@@ -8,11 +9,8 @@ from jaxsimp.planning.actions import (
     GaussianIndex,
     Joint,
 )
-from jaxsimp.planning.cem import CEMConfig, Search, search
-from jaxsimp.planning.engine import Engine, MassSprings
-from jaxsimp.planning.ensemble import Ensemble, Spread, make_ensemble
+from jaxsimp.planning.evaluate import Layout, PopulationMap, default_layout
 from jaxsimp.planning.plan import Execution, Plan, Planner, load_plan, save_plan
-from jaxsimp.planning.population import Layout, PopulationMap, default_layout
 
 __all__ = [
     "ENCODINGS",
@@ -20,21 +18,16 @@ __all__ = [
     "CEMConfig",
     "Categorical",
     "Encoding",
-    "Engine",
-    "Ensemble",
     "Execution",
     "GaussianIndex",
     "Joint",
     "Layout",
-    "MassSprings",
     "Plan",
     "Planner",
     "PopulationMap",
     "Search",
-    "Spread",
     "default_layout",
     "load_plan",
-    "make_ensemble",
     "save_plan",
     "search",
 ]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray, PyTree
 
 from jaxsimp.dynamics import Actions
-from jaxsimp.planning.actions import ActionSpace, Encoding
+from jaxsimp.planning.encodings import ActionSpace, Encoding
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxsimp.dynamics import NONE, Actions, State, at_rest
-from jaxsimp.planning.actions import ActionSpace, Encoding
+from jaxsimp.engines import Engine, Ensemble, MassSprings
+from jaxsimp.engines.ensemble import over_members
 from jaxsimp.planning.cem import CEMConfig, Search, search
-from jaxsimp.planning.engine import Engine, MassSprings
-from jaxsimp.planning.ensemble import Ensemble, over_members
-from jaxsimp.planning.population import Layout, PopulationMap, default_layout
+from jaxsimp.planning.encodings import ActionSpace, Encoding
+from jaxsimp.planning.evaluate import Layout, PopulationMap, default_layout
 from jaxsimp.tasks import Episode, Task, score
 
 

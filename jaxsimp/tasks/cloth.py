@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth
+from jaxsimp.bodies import Body, cloth
 from jaxsimp.tasks.costs import distance, distance_cost
 from jaxsimp.tasks.task import Episode, Task, register
 

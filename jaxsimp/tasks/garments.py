@@ -1,6 +1,7 @@
 """Tasks of garments."""
 
-from jaxsimp import garments, goals
+from jaxsimp import goals
+from jaxsimp.bodies import garments
 from jaxsimp.tasks.cloth import flat_task
 from jaxsimp.tasks.task import Task, register
 

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp import goals
-from jaxsimp.body import Body, rope
+from jaxsimp.bodies import Body, rope
 from jaxsimp.tasks.costs import distance, distance_cost, matching_cost
 from jaxsimp.tasks.crumple import crumple
 from jaxsimp.tasks.task import Episode, Task, register

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp import goals
-from jaxsimp.body import Body
+from jaxsimp.bodies import Body
 from jaxsimp.dynamics import (
     Pickers,
     Simulation,

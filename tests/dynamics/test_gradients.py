@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth, rope
+from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.dynamics import NONE, Actions, State, make_pickers, make_simulation, rollout, springs
 from jaxsimp.dynamics.springs import make_springs, pull, spring_tensions
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.body import cloth, rope
+from jaxsimp.bodies import cloth, rope
 from jaxsimp.dynamics import (
     NONE,
     Actions,

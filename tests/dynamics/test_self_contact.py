@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth, rope
+from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.dynamics import (
     NONE,
     Actions,
@@ -23,8 +23,7 @@ from jaxsimp.dynamics import (
     rollout,
     settle,
 )
-from jaxsimp.dynamics.layers import AHEAD, MOST_LAYERS_OF_ROPES, SPARE, make_self_contact
-from jaxsimp.dynamics.self_contact import (
+from jaxsimp.dynamics.contact.layers import (
     SEARCH,
     Contacts,
     _across,
@@ -33,6 +32,7 @@ from jaxsimp.dynamics.self_contact import (
     resolve,
     touch,
 )
+from jaxsimp.dynamics.contact.settings import AHEAD, MOST_LAYERS_OF_ROPES, SPARE, make_self_contact
 from jaxsimp.planning import default_layout
 from jaxsimp.tasks import make_task
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsimp.body import Body, cloth, rope
+from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.dynamics import State, largest_time_step, make_simulation, settle
 
 jit_settle = jax.jit(settle, static_argnames="num_steps")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth, rope
+from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.dynamics import Actions, Simulation, State, make_pickers, make_simulation, rollout
 from jaxsimp.dynamics import springs as springs_module
 from jaxsimp.dynamics.springs import pull, spring_tensions

@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jaxsimp import garments
-from jaxsimp.body import Body, cloth, rope
+from jaxsimp.bodies import Body, cloth, garments, rope
 from jaxsimp.dynamics import (
     NONE,
     Actions,
@@ -23,15 +22,10 @@ from jaxsimp.dynamics import (
     make_simulation,
     rollout,
 )
-from jaxsimp.engines import (
-    MJX,
-    compare_with_mjx,
-    make_mjx_simulation,
-    mjx_rollout,
-    tendon_spec,
-)
-from jaxsimp.engines import mjx as mjx_module
-from jaxsimp.planning import ENCODINGS, CEMConfig, Engine, Layout, MassSprings, Planner
+from jaxsimp.engines import Engine, MassSprings
+from jaxsimp.engines.mjx import MJX, compare_with_mjx, make_mjx_simulation, mjx_rollout, tendon_spec
+from jaxsimp.engines.mjx import engine as mjx_module
+from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner
 from jaxsimp.tasks import make_task
 
 # MJX relies on rank promotion.
@@ -216,7 +210,7 @@ import sys
 import jaxsimp.engines
 assert "mujoco" not in sys.modules
 sys.modules["warp"] = None  # what MJX misses, and says so
-from jaxsimp.body import rope
+from jaxsimp.bodies import rope
 jaxsimp.engines.make_mjx_simulation(rope(3), 1e-3)
 assert "mujoco.mjx" in sys.modules
 """

@@ -21,8 +21,8 @@ from experiments.benchmark.measure import (
     prepare,
     time_in_turns,
 )
-from experiments.engines import ENGINES
-from experiments.engines.workload import UnavailableError
+from experiments.benchmark.peers import ENGINES
+from experiments.benchmark.peers.workload import UnavailableError
 
 TINY = dataclasses.replace(
     QUICK,

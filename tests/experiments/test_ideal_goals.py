@@ -15,8 +15,9 @@ from experiments.ideal_goals import (
     rounded_fold,
 )
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
-from jaxsimp import body, goals
-from jaxsimp.simplify import KeyPoints
+from jaxsimp import goals
+from jaxsimp.bodies import body
+from jaxsimp.simplification import KeyPoints
 
 ROUNDING = 1e-12  # metres
 

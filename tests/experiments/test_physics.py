@@ -13,9 +13,9 @@ from experiments.physics import __main__ as command
 from experiments.physics import against_mujoco, measure, resolution, self_contact, swings
 from experiments.scripted import scripted_plan
 from jaxsimp import goals
-from jaxsimp.body import cloth, rope
+from jaxsimp.bodies import cloth, rope
 from jaxsimp.dynamics import State, at_rest, rollout, settle
-from jaxsimp.engines.flex import POISSON, stretch_stiffness
+from jaxsimp.engines.mujoco.model import POISSON, stretch_stiffness
 from jaxsimp.tasks import make_task
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from experiments import run
-from experiments.records import read_rows
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
-from jaxsimp.planning import CEMConfig, Layout, MassSprings, Planner, load_plan, make_ensemble
+from jaxsimp.engines import MassSprings, make_ensemble
+from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan
+from jaxsimp.records import read_rows
 from jaxsimp.tasks import make_task, score, task_names
 
 TASKS = ("rope_straightening", "cloth_diagonal_folding")

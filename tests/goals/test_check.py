@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth, from_mesh, rope
-from jaxsimp.garments import t_shirt
+from jaxsimp.bodies import Body, cloth, from_mesh, rope
+from jaxsimp.bodies.garments import t_shirt
 from jaxsimp.goals.check import NOISE
 
 CLOTH = cloth((6, 5), (0.3, 0.2))

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.body import cloth, rope
-from jaxsimp.garments import t_shirt
+from jaxsimp.bodies import cloth, rope
+from jaxsimp.bodies.garments import t_shirt
 from jaxsimp.goals.files import load_body
 
 CLOTH = cloth((6, 5), (0.3, 0.2))

@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.body import cloth
-from jaxsimp.garments import t_shirt, trousers
+from jaxsimp.bodies import cloth
+from jaxsimp.bodies.garments import t_shirt, trousers
+from jaxsimp.bodies.meshes import half_edges
 from jaxsimp.goals.flatten import flatten
-from jaxsimp.meshes import half_edges
-from jaxsimp.simplify import simplify
+from jaxsimp.simplification import simplify
 
 CLOTH = cloth()  # 25 x 25, 0.3 m
 FOLDS = ("side", "diagonal", "letter", "quarter")

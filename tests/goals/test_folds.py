@@ -6,8 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.body import Body, cloth, rope
-from jaxsimp.garments import skirt, t_shirt, towel, trousers
+from jaxsimp.bodies import Body, cloth, rope
+from jaxsimp.bodies.garments import skirt, t_shirt, towel, trousers
 
 # Float64 coordinates of about 1 m, a few operations each.
 ROUNDING = 1e-12

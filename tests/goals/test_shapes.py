@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.body import cloth, rope, rope_along
+from jaxsimp.bodies import cloth, rope, rope_along
 
 # Float64 coordinates of about 1 m, a few operations each.
 ROUNDING = 1e-12

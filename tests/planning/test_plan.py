@@ -11,16 +11,8 @@ import numpy as np
 import pytest
 
 from jaxsimp.dynamics import NONE, Actions, at_rest, make_pickers, rollout, settle
-from jaxsimp.planning import (
-    ENCODINGS,
-    CEMConfig,
-    Layout,
-    MassSprings,
-    Plan,
-    Planner,
-    load_plan,
-    save_plan,
-)
+from jaxsimp.engines import MassSprings
+from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Plan, Planner, load_plan, save_plan
 from jaxsimp.planning import plan as plan_module
 from jaxsimp.tasks import make_task, score
 

@@ -1,0 +1,53 @@
+"""jaxsimp itself: its rollout, laid on the machine by its PopulationMap."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from experiments.benchmark.peers.workload import GRAVITY, Workload
+from jaxsimp.dynamics import (
+    Actions,
+    Pickers,
+    Simulation,
+    at_rest,
+    make_pickers,
+    make_simulation,
+    rollout,
+)
+from jaxsimp.planning import Layout, PopulationMap, default_layout
+
+Physics = tuple[Simulation, Pickers, Array]
+"""A simulation, its pickers, and the positions at first."""
+
+
+def prepare(workload: Workload, layout: Layout | None = None) -> Callable[[], np.ndarray]:
+    """A function giving the final positions, shape (B, N, 3), metres.
+
+    Args:
+        workload: what is computed.
+        layout: of the population; jaxsimp's own choice by default.
+    """
+    shared, actions = physics(workload), plans(workload)
+    layout = layout or default_layout(workload.population, shared[0])
+    mapped = PopulationMap(final_position, shared, actions, layout)
+    return lambda: mapped(shared, actions)
+
+
+def final_position(physics: Physics, actions: Actions) -> Array:
+    """Positions at the end of one plan, shape (N, 3), metres."""
+    simulation, pickers, start = physics
+    return rollout(simulation, pickers, at_rest(start), actions)[0].position
+
+
+def physics(workload: Workload) -> Physics:
+    """The workload's body, with pickers whose limits do not bind."""
+    pickers = make_pickers((1.0, 1.0, 1.0), max_stretch=1e6, steps=workload.action_steps)
+    simulation = make_simulation(workload.body, workload.time_step, GRAVITY)
+    return simulation, pickers, jnp.asarray(workload.start, dtype=float)
+
+
+def plans(workload: Workload) -> Actions:
+    """The workload's plans, leading axis `B`."""
+    return Actions(jnp.asarray(workload.pick), jnp.asarray(workload.displacement, dtype=float))

@@ -1,0 +1,392 @@
+"""Calibration: the physics of a body from motions that were seen, by gradient descent.
+
+Stiffness, damping, drag and friction are scaled until replays of recorded actions go through the
+recorded positions. The gradient goes backwards through every time step (adjoint.py).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from math import ceil, log
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxsimp.bodies import Body
+from jaxsimp.dynamics.pickers import Actions, Pickers, make_pickers
+from jaxsimp.dynamics.rollout import rollout
+from jaxsimp.dynamics.simulation import Simulation, State, largest_time_step, make_simulation
+from jaxsimp.dynamics.springs import make_springs
+
+PARAMETERS = ("stiffness", "damping", "drag", "friction")
+"""What can be fitted."""
+LONGEST_TIME_STEP = 2e-3
+"""Of replays, seconds."""
+MOST_KINDS = 4
+"""Springs of more different stiffnesses than this have one factor together."""
+
+Factors = dict[str, Float[Array, "..."]]
+"""By name of the parameter: shape (kinds,) for stiffness, () for the others."""
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["start", "actions", "positions"], meta_fields=[]
+)
+@dataclass(frozen=True)
+class Recording:
+    """A motion that was seen.
+
+    Attributes:
+        start: positions and velocities before the first action, shape (N, 3).
+        actions: what pickers did, shapes (T, G) and (T, G, 3).
+        positions: after each action, shape (T, N, 3), metres.
+    """
+
+    start: State
+    actions: Actions
+    positions: Float[Array | np.ndarray, "... T N 3"]
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """Settings of a calibration.
+
+    Attributes:
+        parameters: which of `PARAMETERS` are fitted; the others stay the body's.
+        steps: of gradient descent (Adam, its learning rate falling to zero as a cosine).
+        learning_rate: the first, in natural logarithms of a factor.
+        largest_factor: on a parameter. All below it must be stable, so the time step gets
+            shorter with the root of it.
+        smallest_factor: on a parameter.
+
+    Raises:
+        ValueError: if a parameter is unknown or a number is out of its range.
+    """
+
+    parameters: tuple[str, ...] = PARAMETERS
+    steps: int = 150
+    learning_rate: float = 0.1
+    largest_factor: float = 5.0
+    smallest_factor: float = 0.01
+    longest_time_step: float = LONGEST_TIME_STEP
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.parameters if name not in PARAMETERS]
+        if unknown or not self.parameters:
+            raise ValueError(
+                f"parameters is {self.parameters}; choose from {', '.join(PARAMETERS)}"
+            )
+        if self.steps < 1:
+            raise ValueError(f"steps is {self.steps}; at least 1 is needed")
+        if not 0 < self.learning_rate < np.inf:
+            raise ValueError(f"learning_rate is {self.learning_rate}; give a number above 0")
+        if not 1 < self.largest_factor < np.inf:
+            raise ValueError(f"largest_factor is {self.largest_factor}; give a number above 1")
+        if not 0 < self.smallest_factor < 1:
+            raise ValueError(
+                f"smallest_factor is {self.smallest_factor}; give a number between 0 and 1"
+            )
+        _check_seconds("longest_time_step", self.longest_time_step)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What a calibration found.
+
+    Attributes:
+        body: with the best physics that was met.
+        factors: of that physics on the body that was given; stiffness has one for each kind.
+        errors: root-mean-square distance of replays from the recordings before each step of
+            the descent and at its end, shape (steps + 1,), metres; not finite where a replay
+            was not.
+    """
+
+    body: Body
+    factors: dict[str, np.ndarray]
+    errors: Float[np.ndarray, " I"]
+
+
+def calibrate(
+    body: Body,
+    recordings: Sequence[Recording],
+    action_seconds: float,
+    config: CalibrationConfig | None = None,
+    *,
+    kinds: Int[np.ndarray, " S"] | None = None,
+    gravity: float = 9.81,
+) -> Calibration:
+    """Fit a body's physics to recordings.
+
+    Minimises the mean squared distance of particles from where they were seen, over the
+    logarithms of factors, from factors of 1. The first steps of the descent look at the first
+    actions only, and from half way on it looks at all: late motion depends on early motion in
+    ways so intricate that a descent on it alone gets stuck. Masses are taken as they are: forces
+    can be told from a motion only in proportion to them.
+
+    Args:
+        body: the first guess.
+        recordings: one or more, of equally many actions and pickers.
+        action_seconds: that each of their actions took.
+        config: settings.
+        kinds: of the springs, counted from 0, shape (S,): those of one kind have one factor on
+            their stiffness. By default springs of equal stiffness are of one kind, and all of
+            them where there are more than `MOST_KINDS` stiffnesses, as in a mesh.
+        gravity: downward acceleration, metres per second squared.
+
+    Raises:
+        ValueError: if recordings do not fit the body or each other, hold a value that is not
+            finite or show no motion; if a parameter is to be fitted that is zero, or kinds are
+            not one for each spring.
+    """
+    config = config or CalibrationConfig()
+    _check_seconds("action_seconds", action_seconds)
+    _check_fitted(body, config)
+    stacked, kinds = _stack(body, recordings), _check_kinds(body, kinds)
+    least_stable = _scaled_body(body, _extremes(config), kinds)
+    time_step, steps = _time_step(least_stable, action_seconds, config.longest_time_step)
+    simulation = make_simulation(body, time_step, gravity)
+    table, count = _kind_table(body, kinds), int(kinds.max(initial=0)) + 1
+    logs, losses = _descend(config, steps, simulation, table, stacked, num_kinds=count)
+    factors = {name: np.asarray(np.exp(np.asarray(logs[name], float))) for name in logs}
+    return Calibration(_scaled_body(body, factors, kinds), factors, np.sqrt(np.asarray(losses)))
+
+
+def simulate_recordings(
+    body: Body,
+    recordings: Sequence[Recording],
+    action_seconds: float,
+    *,
+    gravity: float = 9.81,
+    longest_time_step: float = LONGEST_TIME_STEP,
+) -> Float[np.ndarray, "R T N 3"]:
+    """Where a body is after each action of recordings, metres.
+
+    Args:
+        body: whose physics is used.
+        recordings: as for `calibrate`.
+        action_seconds: that each of their actions took.
+        gravity: downward acceleration, metres per second squared.
+        longest_time_step: seconds; shorter ones are taken where stability asks for them.
+
+    Raises:
+        ValueError: as `calibrate` does for recordings.
+    """
+    _check_seconds("action_seconds", action_seconds)
+    _check_seconds("longest_time_step", longest_time_step)
+    stacked = _stack(body, recordings)
+    time_step, steps = _time_step(body, action_seconds, longest_time_step)
+    return np.asarray(_replays(steps, make_simulation(body, time_step, gravity), stacked))
+
+
+def recording_error(
+    body: Body, recordings: Sequence[Recording], action_seconds: float, **options: float
+) -> float:
+    """Root-mean-square distance, metres, of particles in replays from where they were seen.
+
+    See `simulate_recordings` for arguments, options and errors.
+    """
+    found = simulate_recordings(body, recordings, action_seconds, **options)
+    wanted = np.stack([np.asarray(recording.positions) for recording in recordings])
+    return float(np.sqrt(np.mean(np.sum((found - wanted) ** 2, axis=-1))))
+
+
+@partial(
+    jax.jit,
+    static_argnums=(0, 1),
+    static_argnames="num_kinds",
+    # Optimised less, gradients compile three times as fast, and run almost as fast.
+    compiler_options={"xla_backend_optimization_level": 1},
+)
+def _descend(
+    config: CalibrationConfig,
+    steps: int,
+    simulation: Simulation,
+    table: Int[Array, "D HN"],
+    recordings: Recording,
+    num_kinds: int,
+) -> tuple[Factors, Float[Array, " I"]]:
+    """The best logarithms of factors, and mean squared distances, square metres."""
+    import optax
+
+    loss_fn = partial(_misfit, steps, simulation, table, recordings)
+    optimizer = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps))
+    low, high = log(config.smallest_factor), log(config.largest_factor)
+
+    def step(
+        carry: tuple[Any, ...], horizon: Float[Array, ""]
+    ) -> tuple[tuple[Any, ...], Float[Array, ""]]:
+        logs, state, best, least = carry
+        (_, loss), gradient = jax.value_and_grad(loss_fn, has_aux=True)(logs, horizon)
+        better = loss < least  # False if it is not finite
+        best, least = _choose(better, logs, best), jnp.where(better, loss, least)
+        finite = jnp.isfinite(loss) & _all_finite(gradient)
+        gradient = _choose(finite, gradient, jax.tree.map(jnp.zeros_like, gradient))
+        updates, state = optimizer.update(gradient, state)
+        # From where there is no gradient it goes on from the best.
+        logs = optax.apply_updates(_choose(finite, logs, best), updates)
+        logs = jax.tree.map(lambda leaf: jnp.clip(leaf, low, high), logs)
+        return (logs, state, best, least), loss
+
+    logs = {name: jnp.zeros(num_kinds if name == "stiffness" else ()) for name in config.parameters}
+    first = (logs, optimizer.init(logs), logs, jnp.asarray(jnp.inf))
+    num_actions = recordings.positions.shape[1]
+    # From the first action to all of them, in the first half of the descent.
+    horizons = jnp.clip(jnp.linspace(1.0, 2.0 * num_actions, config.steps), 1.0, num_actions)
+    (logs, _, best, least), losses = jax.lax.scan(step, first, horizons)
+    last = loss_fn(logs, horizons[-1])[1]
+    unit = _motion(recordings)
+    return _choose(last < least, logs, best), jnp.append(losses, last) * unit
+
+
+def _misfit(
+    steps: int,
+    simulation: Simulation,
+    table: Int[Array, "D HN"],
+    recordings: Recording,
+    logs: Factors,
+    horizon: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean squared distance of replays up to a horizon, a number of actions, and of all.
+
+    In units of the motion, so that Adam's own epsilon is small beside it.
+    """
+    scaled = _scaled(simulation, table, jax.tree.map(jnp.exp, logs))
+    missed = _replays(steps, scaled, recordings) - recordings.positions
+    by_action = jnp.mean(jnp.sum(missed**2, axis=-1), axis=(0, 2)) / _motion(recordings)
+    weights = jnp.clip(horizon - jnp.arange(len(by_action)), 0.0, 1.0)
+    return jnp.vdot(weights, by_action) / weights.sum(), by_action.mean()
+
+
+def _motion(recordings: Recording) -> Float[Array, ""]:
+    """Mean squared distance of particles from where they started, square metres."""
+    moved = recordings.positions - recordings.start.position[:, None]
+    return jnp.mean(jnp.sum(moved**2, axis=-1))
+
+
+def _replays(steps: int, simulation: Simulation, recordings: Recording) -> Float[Array, "R T N 3"]:
+    """Positions after each action, of all recordings."""
+    # Pickers did what they did: no limit applies.
+    pickers: Pickers = make_pickers((1e3, 1e3, 1e3), max_stretch=1e6, steps=steps)
+
+    def one(recording: Recording) -> Float[Array, "T N 3"]:
+        return rollout(simulation, pickers, recording.start, recording.actions)[1]
+
+    return jax.lax.map(one, recordings)
+
+
+def _scaled(simulation: Simulation, table: Int[Array, "D HN"], factors: Factors) -> Simulation:
+    springs, changes = simulation.springs, dict(factors)
+    if "stiffness" in changes:
+        factor = changes.pop("stiffness")[table]
+        springs = replace(springs, stiffness=springs.stiffness * factor)
+    if "damping" in changes:
+        springs = replace(springs, damping=springs.damping * changes.pop("damping"))
+    own: dict[str, Any] = {name: getattr(simulation, name) * changes[name] for name in changes}
+    return replace(simulation, springs=springs, **own)
+
+
+def _scaled_body(body: Body, factors: dict[str, np.ndarray], kinds: Int[np.ndarray, " S"]) -> Body:
+    factors = {name: np.ones(()) for name in PARAMETERS} | factors
+    stiffness = np.broadcast_to(factors["stiffness"], kinds.max(initial=0) + 1)
+    return replace(
+        body,
+        stiffness=body.stiffness * stiffness[kinds],
+        damping=body.damping * factors["damping"],
+        drag=body.drag * float(factors["drag"]),
+        friction=body.friction * float(factors["friction"]),
+    )
+
+
+def _kind_table(body: Body, kinds: Int[np.ndarray, " S"]) -> Int[Array, "D HN"]:
+    """Kinds in the rows that springs are stored in; 0 where there is no spring."""
+    table = make_springs(replace(body, stiffness=kinds + 1.0)).stiffness
+    return jnp.maximum(table.astype(int) - 1, 0)
+
+
+def _extremes(config: CalibrationConfig) -> dict[str, np.ndarray]:
+    """The largest factors: the least stable physics that may be met."""
+    return {name: np.asarray(config.largest_factor) for name in config.parameters}
+
+
+def _time_step(body: Body, action_seconds: float, longest: float) -> tuple[float, int]:
+    """A time step that is stable, seconds, and how many of them an action has."""
+    steps = ceil(action_seconds / min(longest, 0.9 * largest_time_step(body)))
+    return action_seconds / steps, steps
+
+
+def _stack(body: Body, recordings: Sequence[Recording]) -> Recording:
+    """Recordings along a first axis, if they fit the body and each other."""
+    if not recordings:
+        raise ValueError("there are no recordings; give at least one")
+    shape = np.shape(recordings[0].actions.pick)
+    for index, recording in enumerate(recordings):
+        _check_recording(index, recording, body.num_particles, shape)
+    stacked = jax.tree.map(
+        lambda *leaves: jnp.stack([_as_array(leaf) for leaf in leaves]), *recordings
+    )
+    if not np.any(np.asarray(stacked.positions != stacked.start.position[:, None])):
+        raise ValueError("no particle moves in any recording; nothing can be told from that")
+    return stacked
+
+
+def _as_array(leaf: Any) -> Array:
+    kind = float if np.issubdtype(np.asarray(leaf).dtype, np.floating) else int
+    return jnp.asarray(leaf, dtype=kind)
+
+
+def _check_recording(index: int, recording: Recording, count: int, shape: tuple[int, ...]) -> None:
+    expected = {
+        "start.position": (np.shape(recording.start.position), (count, 3)),
+        "start.velocity": (np.shape(recording.start.velocity), (count, 3)),
+        "actions.pick": (np.shape(recording.actions.pick), shape),
+        "actions.displacement": (np.shape(recording.actions.displacement), (*shape, 3)),
+        "positions": (np.shape(recording.positions), (*shape[:1], count, 3)),
+    }
+    for name, (found, wanted) in expected.items():
+        if found != wanted:
+            raise ValueError(
+                f"{name} of recording {index} has shape {found}; {wanted} is needed for "
+                f"{count} particles and as many actions and pickers in every recording"
+            )
+    for leaf in jax.tree.leaves(recording):
+        if not np.all(np.isfinite(np.asarray(leaf))):
+            raise ValueError(
+                f"recording {index} has a value that is not finite; leave such moments out"
+            )
+
+
+def _check_kinds(body: Body, kinds: Int[np.ndarray, " S"] | None) -> Int[np.ndarray, " S"]:
+    if kinds is None:
+        values, kinds = np.unique(body.stiffness, return_inverse=True)
+        return kinds if len(values) <= MOST_KINDS else np.zeros_like(kinds)
+    if kinds.shape != body.stiffness.shape or kinds.min(initial=0) < 0:
+        raise ValueError(
+            f"kinds has shape {kinds.shape} and least value {kinds.min(initial=0)}; give one "
+            f"number from 0 for each of {len(body.stiffness)} springs"
+        )
+    return kinds
+
+
+def _check_seconds(name: str, seconds: float) -> None:
+    if not 0 < seconds < np.inf:
+        raise ValueError(f"{name} is {seconds}; give a finite number above zero")
+
+
+def _check_fitted(body: Body, config: CalibrationConfig) -> None:
+    zero = [name for name in config.parameters if not np.any(getattr(body, name))]
+    if zero:
+        raise ValueError(
+            f"{zero[0]} of the body is 0, and no factor changes that; start from a number "
+            f"above zero, or leave it out of `parameters`"
+        )
+
+
+def _choose(condition: Array, first: PyTree[Any], second: PyTree[Any]) -> PyTree[Any]:
+    return jax.tree.map(partial(jnp.where, condition), first, second)
+
+
+def _all_finite(tree: PyTree[Any]) -> Array:
+    return jnp.all(jnp.asarray([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(tree)]))

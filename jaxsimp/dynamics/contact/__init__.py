@@ -1,0 +1,1 @@
+"""Contact: with the table, and of a body with itself."""

@@ -1,0 +1,1 @@
+"""Contact compiled for the CPU, and how XLA calls it."""

@@ -1,0 +1,191 @@
+"""How a body touches itself: what self-contact has to know of it, and the speeds it bears."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxsimp.bodies import Body
+from jaxsimp.bodies.meshes import face_areas
+
+TOP_SPEED = 2.1
+"""Default of the fastest that pickers may move, metres per second."""
+SPARE = 1.05
+"""Times the thickness that layers are held apart: what presses them pushes them in a little."""
+INTERVAL = 1
+"""Default of the time steps from contact to contact."""
+AHEAD = 1
+"""Intervals for which is looked ahead: the farther, the more is found, and the longer it lasts."""
+MOST_LAYERS_OF_SHEETS = 1.1
+"""Thicknesses that a picker may move in an interval."""
+MOST_LAYERS_OF_ROPES = 0.75
+"""The same for ropes: struck faster, they stretch until their gaps let others through."""
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "frame",
+        "apart",
+        "adjacent",
+        "thickness",
+        "lateral",
+        "margin",
+        "slack",
+        "squash",
+        "friction",
+    ],
+    meta_fields=["is_sheet", "interval"],
+)
+@dataclass(frozen=True)
+class SelfContact:
+    """How a body touches itself.
+
+    Attributes:
+        frame: ids `a, b, c, d` for each particle: its sheet's normal is along
+            `(x_a - x_b) x (x_c - x_d)`, its rope's tangent along `x_a - x_b`, shape (4, N).
+        apart: rest coordinates, unconnected parts moved away from each other, shape (3, N), metres.
+        adjacent: pairs closer than that at rest do not collide, metres.
+        thickness: distance that layers are held apart, `SPARE` times the body's, metres.
+        lateral: particles touch that are not farther apart along their layers, metres.
+        margin: how far is looked beyond what touches, metres.
+        slack: how far one that touches may move until contacts are looked up again, metres.
+        squash: how much larger than across the sheet distances along it may be: a particle is above
+            another where `across^2 (1 + squash)` exceeds the square of their distance.
+        friction: Coulomb coefficient between layers.
+        is_sheet: or else a rope, static.
+        interval: time steps from contact to contact, static.
+    """
+
+    frame: Int[Array, "... 4 N"]
+    apart: Float[Array, "... 3 N"]
+    adjacent: Float[Array, "..."]
+    thickness: Float[Array, "..."]
+    lateral: Float[Array, "..."]
+    margin: Float[Array, "..."]
+    slack: Float[Array, "..."]
+    squash: Float[Array, "..."]
+    friction: Float[Array, "..."]
+    is_sheet: bool
+    interval: int
+
+
+def make_self_contact(
+    body: Body,
+    time_step: float,
+    *,
+    top_speed: float = TOP_SPEED,
+    friction: float | None = None,
+    interval: int = INTERVAL,
+) -> SelfContact:
+    """How a body touches itself.
+
+    Args:
+        body: a sheet, or, where it has no triangles, one or several ropes.
+        time_step: of the simulation, seconds.
+        top_speed: fastest that a picker moves, metres per second.
+        friction: Coulomb coefficient between layers; by default that with the table.
+        interval: time steps from contact to contact.
+
+    Raises:
+        ValueError: if the body has no thickness, pickers are too fast for it, or a number is out
+            of its range.
+    """
+    thickness = 2 * body.radius
+    if not thickness > 0:
+        raise ValueError("radius is 0; self-contact needs a body of some thickness: give a radius")
+    if interval < 1:
+        raise ValueError(f"interval is {interval}; contact acts after at least 1 time step")
+    friction = body.friction if friction is None else friction
+    if not 0 <= friction < np.inf:
+        raise ValueError(f"friction is {friction}; give a finite number, zero or more")
+    seconds = interval * time_step
+    is_sheet = len(body.faces) > 0
+    layers = MOST_LAYERS_OF_SHEETS if is_sheet else MOST_LAYERS_OF_ROPES
+    fastest = layers * thickness / seconds
+    if not 0 < top_speed <= fastest:
+        raise ValueError(
+            f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "
+            f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s when contact "
+            f"acts every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a "
+            f"smaller time step or interval, or a larger radius; or leave self-contact out"
+        )
+    covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
+    # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.
+    stretch = max(1.0, covering**2 / (3 * thickness**2)) if is_sheet else 1.0
+
+    def array(value: float | np.ndarray) -> Array:
+        return jnp.asarray(value, dtype=float)
+
+    return SelfContact(
+        frame=jnp.asarray(_frames(body), dtype=int),
+        apart=array(_apart(body).T),
+        adjacent=array(max(1.25 * body.rest_length.max(), 2 * thickness)),
+        thickness=array(SPARE * thickness),
+        lateral=array(1.2 * covering),
+        margin=array(AHEAD * top_speed * seconds),
+        slack=array(0.25 * covering),
+        squash=array(stretch - 1),
+        friction=array(friction),
+        is_sheet=is_sheet,
+        interval=interval,
+    )
+
+
+def _spacing(body: Body) -> float:
+    """Longest distance to the nearest neighbour in a rope, metres."""
+    shortest = np.full(body.num_particles, np.inf)
+    np.minimum.at(shortest, body.springs, body.rest_length[:, None])
+    return float(shortest.max())
+
+
+def _covering_radius(body: Body) -> float:
+    """Discs this large about the corners cover every triangle, metres."""
+    corners = body.rest[body.faces]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    area = face_areas(body.rest, body.faces)
+    around = sides.prod(axis=1) / (4 * area)
+    longest = sides.max(axis=1)
+    obtuse = 2 * longest**2 > (sides**2).sum(axis=1)
+    return float(np.where(obtuse, longest / 2, around).max())
+
+
+def _apart(body: Body) -> np.ndarray:
+    """Rest coordinates, each part that no spring joins to the others far from them."""
+    from scipy import sparse
+
+    first, second = body.springs.T
+    shape = (body.num_particles, body.num_particles)
+    graph = sparse.csr_array((np.ones(len(first)), (first, second)), shape=shape)
+    _, part = sparse.csgraph.connected_components(graph, directed=False)
+    return body.rest + 10 * body.size * part[:, None] * np.array([1.0, 0.0, 0.0])
+
+
+def _frames(body: Body) -> np.ndarray:
+    """Ids for `SelfContact.frame`: the farthest apart, and the most square to them, around each."""
+    neighbours = _neighbours(body)
+    frames = np.zeros((4, body.num_particles), dtype=int)
+    for particle, others in enumerate(neighbours):
+        ids = np.append(others, particle)
+        first, second = np.triu_indices(len(ids), k=1)
+        along = body.rest[ids[first]] - body.rest[ids[second]]
+        best = np.argmax(np.linalg.norm(along, axis=1))
+        square = np.argmax(np.linalg.norm(np.cross(along[best], along), axis=1))
+        frames[:, particle] = ids[[first[best], second[best], first[square], second[square]]]
+    return frames
+
+
+def _neighbours(body: Body) -> list[np.ndarray]:
+    """Next neighbours of each particle: along edges of triangles, or the shorter springs."""
+    if len(body.faces):
+        pairs = np.concatenate(
+            [body.faces[:, [0, 1]], body.faces[:, [1, 2]], body.faces[:, [2, 0]]]
+        )
+    else:
+        pairs = body.springs[body.rest_length < 1.5 * _spacing(body)]
+    pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
+    counts = np.bincount(pairs[:, 0], minlength=body.num_particles)
+    return np.split(pairs[:, 1], np.cumsum(counts)[:-1])

@@ -1,0 +1,211 @@
+"""MJX, MuJoCo in JAX, as an oracle of our dynamics and as an engine of the planner.
+
+A body is what `tendon_spec` makes of it. MJX computes accelerations and takes the Euler steps; to
+carry out plans, our table and our pickers correct the velocities of each step, as they do in our
+own dynamics: MJX has contacts of its own, but each costs rows of a constraint solver, and
+their friction is not Coulomb's. So MJX checks springs, gravity, drag and integration; it is no
+second opinion on contact. Gradients are not promised.
+"""
+
+import contextlib
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxsimp.bodies import Body
+from jaxsimp.dynamics import Actions, Pickers, State, make_simulation
+from jaxsimp.dynamics.contact.table import table_contact
+from jaxsimp.dynamics.pickers import grasp, speed_profile
+from jaxsimp.engines.mjx.tendons import tendon_spec
+from jaxsimp.tasks import Task
+
+MOST_PARTICLES = 100
+"""Larger bodies are refused: a step costs as much as springs times particles. In plans on a CPU it
+takes about fifty times as long as our own for a rope of 11, a thousand times for a 9 x 9 cloth."""
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["model", "data", "rest", "radius", "friction"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class MJXSimulation:
+    """A body's physics in MJX, and what our table and pickers need to know of it.
+
+    Attributes:
+        model: a `mujoco.mjx.Model`.
+        data: a `mujoco.mjx.Data` to put states into.
+        rest: rest coordinates, shape (N, 3), metres.
+        radius: height of a particle that lies on the table, metres.
+        friction: Coulomb coefficient with the table.
+    """
+
+    model: Any
+    data: Any
+    rest: Float[Array, "... N 3"]
+    radius: Float[Array, "..."]
+    friction: Float[Array, "..."]
+
+    @property
+    def time_step(self) -> Float[Array, "..."]:
+        """Seconds."""
+        return self.model.opt.timestep
+
+
+def make_mjx_simulation(
+    body: Body, time_step: float = 2e-3, gravity: float = 9.81
+) -> MJXSimulation:
+    """The simulation of a body in MJX.
+
+    Args:
+        body: what is simulated.
+        time_step: seconds, at most `jaxsimp.dynamics.largest_time_step(body)`.
+        gravity: downward acceleration, metres per second squared.
+
+    Raises:
+        ValueError: if the body has more than `MOST_PARTICLES` particles, or
+            `jaxsimp.dynamics.make_simulation` refuses it.
+    """
+    if body.num_particles > MOST_PARTICLES:
+        raise ValueError(
+            f"the {body.name} has {body.num_particles} particles; MJX takes at most "
+            f"{MOST_PARTICLES}, for its steps are slow. Take fewer particles, or our own "
+            f"dynamics"
+        )
+    ours = make_simulation(body, time_step, gravity)
+    model = to_mjx(tendon_spec(body, time_step, gravity).compile())
+    return MJXSimulation(
+        model, _mjx().make_data(model, impl="jax"), ours.rest, ours.radius, ours.friction
+    )
+
+
+def to_mjx(model: Any) -> Any:
+    """A `mujoco.MjModel` as a `mujoco.mjx.Model`.
+
+    Raises:
+        ValueError: if the model has a flex: MJX has none.
+    """
+    if model.nflex:
+        raise ValueError(
+            f"the model has {model.nflex} flex; MJX has none. Make the body of tendons "
+            f"(tendon_spec), or simulate it in MuJoCo itself"
+        )
+    return _mjx().put_model(model, impl="jax")
+
+
+def mjx_accelerations(simulation: MJXSimulation, state: State) -> Float[Array, "N 3"]:
+    """Accelerations without table and pickers, metres per second squared."""
+    data = _mjx().forward(simulation.model, _loaded(simulation, state))
+    return data.qacc.reshape(state.position.shape)
+
+
+def mjx_trajectory(
+    simulation: MJXSimulation, state: State, num_steps: int
+) -> tuple[State, Float[Array, "T N 3"]]:
+    """Motion by MJX alone, without table and pickers.
+
+    Returns:
+        States after each of `num_steps` steps, and the accelerations that led there, stacked
+        along a first axis.
+    """
+
+    def one(state: State, _: None) -> tuple[State, tuple[State, Float[Array, "N 3"]]]:
+        state, acceleration = _free_step(simulation, state)
+        return state, (state, acceleration)
+
+    return jax.lax.scan(one, state, length=num_steps)[1]
+
+
+def mjx_rollout(
+    simulation: MJXSimulation,
+    pickers: Pickers,
+    state: State,
+    actions: Actions,
+    observe: Callable[[State], PyTree[Any]] = lambda state: state.position,
+) -> tuple[State, PyTree[Any]]:
+    """Carry out a plan in MJX: arguments and result as of `jaxsimp.dynamics.rollout`."""
+
+    def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:
+        held, displacement = grasp(
+            pickers, simulation.rest, simulation.radius, state.position, action
+        )
+        drive = displacement / simulation.time_step
+
+        def one(state: State, share: Float[Array, ""]) -> tuple[State, None]:
+            return _step(simulation, state, held, drive * share), None
+
+        state, _ = jax.lax.scan(one, state, speed_profile(pickers.steps))
+        return state, observe(state)
+
+    return jax.lax.scan(act, state, actions)
+
+
+def _step(
+    simulation: MJXSimulation,
+    state: State,
+    held: Bool[Array, " N"],
+    carried: Float[Array, "N 3"],
+) -> State:
+    """A step of MJX with velocities after contact; held particles have those of `carried`."""
+    free = _free_step(simulation, state)[0].velocity
+    above = state.position[:, 2] - simulation.radius
+    touched = table_contact(above, list(free.T), simulation.friction, simulation.time_step)
+    velocity = jnp.where(held[:, None], carried, jnp.stack(touched, axis=1))
+    return State(state.position + simulation.time_step * velocity, velocity)
+
+
+def _free_step(simulation: MJXSimulation, state: State) -> tuple[State, Float[Array, "N 3"]]:
+    """A step of MJX alone, and the accelerations in it."""
+    data = _mjx().step(simulation.model, _loaded(simulation, state))
+    position, velocity, acceleration = (
+        array.reshape(state.position.shape) for array in (data.qpos, data.qvel, data.qacc)
+    )
+    return State(position, velocity), acceleration
+
+
+def _loaded(simulation: MJXSimulation, state: State) -> Any:
+    """The data of MJX with this state."""
+    return simulation.data.replace(qpos=state.position.ravel(), qvel=state.velocity.ravel())
+
+
+@cache
+def _mjx() -> Any:
+    """The module `mujoco.mjx`."""
+    # It prints which of its parts cannot be had here; standard output is our caller's.
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
+
+
+@dataclass(frozen=True)
+class MJX:
+    """MJX as the engine of a planner: `Planner(task, config, engine=MJX())`.
+
+    For ropes and small cloths, with patience: bodies of more than `MOST_PARTICLES` are refused.
+    They pass through themselves: MJX has no flexible bodies.
+    """
+
+    def physics(self, task: Task) -> tuple[MJXSimulation, Pickers]:
+        """The task's simulation in MJX, and its pickers.
+
+        Raises:
+            ValueError: if the body has too many particles.
+        """
+        return make_mjx_simulation(task.body, task.time_step), task.pickers()
+
+    def rollout(
+        self,
+        physics: tuple[MJXSimulation, Pickers],
+        state: State,
+        actions: Actions,
+        observe: Callable[[State], PyTree[Any]],
+    ) -> tuple[State, PyTree[Any]]:
+        """See `mjx_rollout`."""
+        return mjx_rollout(*physics, state, actions, observe)

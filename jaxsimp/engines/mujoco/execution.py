@@ -1,0 +1,230 @@
+"""Plans carried out in MuJoCo: the same limits, stretch rule and speed profile as in ours.
+
+What a picker may do is asked of `jaxsimp.dynamics.pickers.grasp`, with the positions that MuJoCo
+has at the start of each action; the particle that it holds is joined to a mocap body, which goes
+along the displacement. Plans run side by side on all cores, each in its own `mujoco.MjData`: a
+plan's result does not depend on the others.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsimp.dynamics import NONE, Actions, Pickers, make_pickers
+from jaxsimp.dynamics.pickers import grasp, speed_profile
+from jaxsimp.engines.mujoco.model import Variant, make_model
+from jaxsimp.machine import num_cores
+from jaxsimp.tasks import Episode, Task, score
+
+LEAD = 4
+"""A mocap body has no velocity, so that the constraint brakes what it holds. With the constraint of
+model.py (critically damped, its time constant two steps) a particle is, after a step of its path,
+just where it should be when the mocap body was four such steps ahead of it."""
+FASTEST = 100.0
+"""Metres per second along an axis: no picker, spring or fall makes a particle this fast."""
+STILL, STILL_SECONDS = 5e-3, 0.1
+"""A body has settled when no particle was faster than this along an axis, metres per second, for
+so long. A folded cloth then creeps on, by some 0.4 mm in the rest of the task's time."""
+
+
+class ReplayStatus(IntEnum):
+    """What became of a plan in MuJoCo.
+
+    `WARNED`: it was carried out, and MuJoCo warned of something, as contacts left out.
+    `UNSTABLE`: a position, velocity or acceleration was not finite or too large (see `FASTEST`);
+    the plan ends there.
+    """
+
+    FINE = 0
+    WARNED = 1
+    UNSTABLE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """What a plan does in MuJoCo.
+
+    Attributes:
+        positions: at the start, after each action, and settled, shape (T + 2, N, 3), metres; not
+            a number after the simulation became unstable.
+        score: normalised score of the settled state, not a number where it is unstable.
+        status: what became of the plan.
+        warnings: names of MuJoCo's warnings.
+    """
+
+    positions: Float[np.ndarray, "T2 N 3"]
+    score: float
+    status: ReplayStatus
+    warnings: tuple[str, ...]
+
+
+def replay(
+    task: Task,
+    episodes: Sequence[Episode],
+    plans: Sequence[Actions],
+    variant: str | Variant = "full",
+    *,
+    num_workers: int | None = None,
+) -> Iterator[Replay]:
+    """Carry out plans in MuJoCo, let the body settle, and score them.
+
+    Results come one by one, in the order of the plans; the first is begun when it is asked for,
+    and the others beside it.
+
+    Args:
+        task: what is asked; its body, limits and times are used.
+        episodes: start and goal of each plan.
+        plans: of any numbers of actions.
+        variant: of the model, see `jaxsimp.engines.mujoco.model`.
+        num_workers: plans at a time; by default as many as there are cores. It changes no result.
+
+    Raises:
+        ValueError: if there are not as many episodes as plans, a plan names a particle that the
+            body does not have, or there is no such variant.
+    """
+    if len(episodes) != len(plans):
+        raise ValueError(
+            f"{len(episodes)} episodes are given for {len(plans)} plans; give one for each"
+        )
+    picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
+    model = make_model(task.body, variant, picked)
+    one = partial(_replay_one, task, model, jax.jit(partial(score, task)))
+    return _side_by_side(one, episodes, plans, num_workers or num_cores())
+
+
+def _side_by_side(
+    one: Callable[[Episode, Actions], Replay],
+    episodes: Sequence[Episode],
+    plans: Sequence[Actions],
+    num_workers: int,
+) -> Iterator[Replay]:
+    with ThreadPoolExecutor(num_workers) as pool:
+        yield from pool.map(one, episodes, plans)
+
+
+def _replay_one(
+    task: Task,
+    model: Any,
+    score_fn: Callable[[Episode, Float[Array, "N 3"]], Float[Array, ""]],
+    episode: Episode,
+    plan: Actions,
+) -> Replay:
+    """Carry out one plan."""
+    scene = _Scene(task, model, np.asarray(episode.start, dtype=float))
+    frames = [scene.positions()]
+    for pick, displacement in zip(
+        np.asarray(plan.pick), np.asarray(plan.displacement), strict=True
+    ):
+        scene.act(pick, displacement)
+        frames.append(scene.positions())
+    scene.settle(task.settle_actions)
+    frames.append(scene.positions())
+    warnings, unstable = scene.warnings(), scene.unstable
+    status = ReplayStatus.UNSTABLE if unstable else ReplayStatus(bool(warnings))
+    value = float("nan") if unstable else float(score_fn(episode, jnp.asarray(frames[-1])))
+    return Replay(np.stack(frames), value, status, warnings)
+
+
+class _Scene:
+    """One simulation and what pickers do in it."""
+
+    def __init__(self, task: Task, model: Any, start: Float[np.ndarray, "N 3"]) -> None:
+        import mujoco
+
+        self._task, self._model, self._data = task, model, mujoco.MjData(model)
+        self._data.qpos[:] = (start - task.body.rest).ravel()
+        self._steps = max(1, round(task.action_seconds / model.opt.timestep))
+        self._pickers = make_pickers(task.limits, steps=self._steps)
+        speed = np.asarray(speed_profile(self._steps), dtype=float)
+        self._ahead = np.cumsum(speed) + (LEAD - 1) * speed
+        self.unstable = False
+
+    def positions(self) -> Float[np.ndarray, "N 3"]:
+        """Of the particles, metres; not a number once the simulation is unstable."""
+        rest = self._task.body.rest
+        if self.unstable:
+            return np.full_like(rest, np.nan)
+        return rest + self._data.qpos.reshape(-1, 3)
+
+    def act(self, pick: np.ndarray, displacement: np.ndarray) -> None:
+        """Carry out one action."""
+        start = self.positions()
+        held, moves = _grasp(self._task, self._pickers, start, pick, displacement)
+        hold = [(self._picker(i), start[i], moves[i]) for i in np.flatnonzero(held).tolist()]
+        for (constraint, _), _, _ in hold:
+            self._data.eq_active[constraint] = 1
+        for share in self._ahead:
+            for (_, mocap), place, move in hold:
+                self._data.mocap_pos[mocap] = place + share * move
+            self._step()
+        for (constraint, _), _, _ in hold:
+            self._data.eq_active[constraint] = 0
+
+    def settle(self, num_actions: int) -> None:
+        """Let the time of some actions pass with nothing held, or less where all comes to rest."""
+        enough, still = max(1, round(STILL_SECONDS / self._model.opt.timestep)), 0
+        for _ in range(num_actions * self._steps):
+            self._step()
+            still = still + 1 if np.abs(self._data.qvel).max() < STILL else 0
+            if still == enough:
+                return
+
+    def warnings(self) -> tuple[str, ...]:
+        """Names of MuJoCo's warnings so far."""
+        import mujoco
+
+        numbers = self._data.warning.number
+        names = [mujoco.mjtWarning(i).name for i in np.flatnonzero(numbers)]
+        return tuple(name.removeprefix("mjWARN_").lower() for name in names)
+
+    def _step(self) -> None:
+        import mujoco
+
+        if self.unstable:
+            return
+        mujoco.mj_step(self._model, self._data)
+        warned = any(self._data.warning.number[kind] for kind in _unstable_kinds())
+        # A solver that does not converge makes speeds that are finite, and nonsense.
+        self.unstable = warned or not np.abs(self._data.qvel).max() < FASTEST
+
+    def _picker(self, particle: int) -> tuple[int, int]:
+        """Constraint and mocap body of a particle."""
+        name = f"picker_{particle}"
+        return self._model.equality(name).id, int(self._model.body(name).mocapid[0])
+
+
+def _unstable_kinds() -> tuple[int, ...]:
+    """Warnings after which the numbers of a simulation mean nothing."""
+    from mujoco import mjtWarning
+
+    kinds = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)
+    return tuple(map(int, kinds))
+
+
+def _grasp(
+    task: Task, pickers: Pickers, position: np.ndarray, pick: np.ndarray, displacement: np.ndarray
+) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
+    """Which particles an action holds, and where it carries each."""
+    action = Actions(jnp.asarray(pick), jnp.asarray(displacement, dtype=float))
+    rest, floor = jnp.asarray(task.body.rest, float), jnp.asarray(task.body.radius, float)
+    held, moves = _jitted_grasp(pickers, rest, floor, jnp.asarray(position, float), action)
+    return np.asarray(held), np.asarray(moves, dtype=float)
+
+
+@jax.jit
+def _jitted_grasp(
+    pickers: Pickers,
+    rest: Float[Array, "N 3"],
+    floor: Float[Array, ""],
+    position: Float[Array, "N 3"],
+    action: Actions,
+) -> tuple[Bool[Array, " N"], Float[Array, "N 3"]]:
+    return grasp(pickers, rest, floor, position, action)

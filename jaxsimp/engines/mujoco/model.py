@@ -1,0 +1,321 @@
+"""Bodies as flexible bodies of MuJoCo: the same sheet or rope, in physics that we did not write.
+
+A particle becomes a body on three slide joints, so `qpos = position - rest` loads any of our
+states. What corresponds and how:
+
+- **mass, air drag, friction, radius**: the same numbers. Drag is that of the air on small cubes.
+- **stretch**: a sheet of springs is, averaged over directions, an elastic membrane, and a rope of
+  springs one along its segments (see `stretch_stiffness`). So is its damping.
+- **bending**: our bend springs resist with the fourth power of the angle, a rod and a plate
+  with its square. Their energies are made equal at a turn of one radian (see
+  `bending_rigidity`).
+
+The "full" variant has all that, and collides with itself. The "fast" one hardly stretches (its
+edges are soft constraints), is limp, and passes through itself. MuJoCo is imported when called.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsimp.bodies import Body
+from jaxsimp.bodies.meshes import face_areas, half_edges
+from jaxsimp.dynamics import largest_time_step
+
+POISSON = 1 / 3
+"""Of every isotropic sheet of springs: their forces are central."""
+GRAVITY = 9.81
+SIDE = 0.01
+"""Of the cube that stands for a particle of mean mass in the air, metres."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What of a body is modelled.
+
+    Attributes:
+        time_step: seconds; an elastic rope, whose springs are integrated explicitly, takes at
+            most a quarter of the largest stable one.
+        elastic: stretches and resists bending as our springs do; or does neither.
+        self_collision: layers and strands touch, with friction.
+    """
+
+    time_step: float
+    elastic: bool
+    self_collision: bool
+
+    def __post_init__(self) -> None:
+        if not 0 < self.time_step < float("inf"):
+            raise ValueError(f"time_step is {self.time_step}; give seconds above zero")
+
+
+VARIANTS = {
+    "fast": Variant(time_step=4e-3, elastic=False, self_collision=False),
+    "full": Variant(time_step=2e-3, elastic=True, self_collision=True),
+}
+
+
+def as_variant(variant: str | Variant) -> Variant:
+    """A variant by its name, or as it is.
+
+    Raises:
+        ValueError: if there is no such name.
+    """
+    if isinstance(variant, Variant):
+        return variant
+    if variant not in VARIANTS:
+        raise ValueError(f"variant is {variant!r}; choose one of {', '.join(VARIANTS)}")
+    return VARIANTS[variant]
+
+
+def stretch_stiffness(body: Body, weight: Float[np.ndarray, " S"]) -> float:
+    """Of the rope, N, or sheet, N/m, that the springs stand for: force over strain, a width.
+
+    A spring of stiffness `k` and length `L` along `n` adds `k L^2 n n n n` over the area to the
+    tensor of a sheet of springs. Averaged over directions that is an isotropic sheet of Poisson's
+    ratio 1/3, and its Young's modulus times thickness is a third of the trace,
+    `sum k L^2 / (3 area)`. For a rope it is `sum k L^2 / length`.
+
+    Args:
+        body: of particles along a line, or with triangles.
+        weight: of the springs: their stiffness, or their damping for how it resists rates.
+    """
+    total = float(np.sum(weight * body.rest_length**2))
+    return total / (3 * _area(body) if len(body.faces) else _length(body))
+
+
+def bending_rigidity(body: Body) -> float:
+    """Rigidity of the rod, N m^2, or plate, N m, that the bend springs stand for.
+
+    A spring of length `L` across a turn `a` in its middle is shortened by `L a^2 / 8`, and has
+    the energy `k L^2 a^4 / 128`; where curvature is `2 a / L`, a rod of rigidity `D` has
+    `2 D a^2 / L^2` a length. Equal at `a = 1` for `D = sum k L^4 / (256 length)`. Over a sheet,
+    a spring at an angle to the curvature feels `cos^8` of it, 35/128 in the mean.
+    """
+    across = ~_is_edge(body)
+    total = float(np.sum((body.stiffness * body.rest_length**4)[across])) / 256
+    return 35 / 128 * total / _area(body) if len(body.faces) else total / _length(body)
+
+
+def make_model(
+    body: Body,
+    variant: str | Variant = "full",
+    graspable: Iterable[int] = (),
+    *,
+    table: bool = True,
+) -> Any:
+    """A body as a compiled `mujoco.MjModel`.
+
+    Args:
+        body: of particles along a line, or with triangles.
+        variant: its name, or what it models.
+        graspable: particles that can be grasped: each has a mocap body `picker_<particle>` and
+            an inactive `connect` constraint of that name.
+        table: whether there is one.
+
+    Raises:
+        ValueError: if there is no such variant or particle.
+    """
+    return _spec(body, as_variant(variant), graspable, table).compile()
+
+
+def save_mjcf(
+    path: str | Path,
+    body: Body,
+    variant: str | Variant = "full",
+    graspable: Iterable[int] = (),
+    position: Float[np.ndarray, "N 3"] | None = None,
+) -> None:
+    """Write a body as MJCF: `python -m mujoco.viewer --mjcf=PATH` opens it.
+
+    Args:
+        path: of the file.
+        body: as for `make_model`.
+        variant: as for `make_model`.
+        graspable: as for `make_model`.
+        position: of a keyframe named "start", shape (N, 3), metres.
+
+    Raises:
+        ValueError: as for `make_model`.
+    """
+    spec = _spec(body, as_variant(variant), graspable, True)
+    if position is not None:
+        spec.add_key(name="start", qpos=(position - body.rest).ravel().tolist())
+    spec.compile()
+    Path(path).write_text(spec.to_xml())
+
+
+def _spec(body: Body, variant: Variant, graspable: Iterable[int], table: bool) -> Any:
+    """The uncompiled model of a body."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.modelname = body.name
+    _set_options(spec, body, variant)
+    names = [f"particle_{i}" for i in range(body.num_particles)]
+    for name, place, mass in zip(names, body.rest, body.mass, strict=True):
+        _add_particle(spec, name, place, float(mass), SIDE * float(mass / body.mass.mean()))
+    radius = _contact_radius(body, variant)
+    contact = {
+        "friction": [body.friction, 0.0, 0.0],
+        "condim": 3,
+        "solref": _stiffest(spec.option.timestep),
+    }
+    flex = spec.add_flex(
+        name="body", vertbody=names, radius=radius, rgba=[0.0, 0.45, 0.7, 1.0], **contact
+    )
+    _set_elements(flex, body, variant)
+    if variant.elastic:
+        (_set_sheet if len(body.faces) else _set_rope)(flex, body)
+    else:
+        # With MuJoCo's impedance: a stiffer one does not converge where edges are many.
+        solref = _stiffest(spec.option.timestep)
+        spec.add_equality(type=mujoco.mjtEq.mjEQ_FLEX, name1="body", solref=solref)
+    if table:
+        spec.worldbody.add_geom(
+            name="table",
+            type=mujoco.mjtGeom.mjGEOM_PLANE,
+            size=[2.0, 2.0, 0.1],
+            pos=[0.0, 0.0, body.radius - radius],
+            rgba=[0.9, 0.9, 0.88, 1.0],
+            **contact,
+        )
+    spec.worldbody.add_light(pos=[0.0, 0.0, 2.0])
+    for particle in sorted(set(map(int, graspable))):
+        _add_picker(spec, body, particle)
+    return spec
+
+
+def _set_options(spec: Any, body: Body, variant: Variant) -> None:
+    """Time step, integrator and solver."""
+    import mujoco
+
+    option = spec.option
+    # A cube of side s in air of this viscosity feels the force 3 pi s viscosity v.
+    option.viscosity = body.drag * float(body.mass.mean()) / (3 * np.pi * SIDE)
+    option.gravity = [0.0, 0.0, -GRAVITY]
+    option.timestep = variant.time_step
+    # Friction is the same in all directions, as ours is.
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    if len(body.faces):
+        # Newton's method, the default, is exact, and ten times slower with the thousands of
+        # contacts of layers. Folds of these iterations end 0.1 and 0.7 mm RMS (side, diagonal)
+        # from those of up to a thousand, solved to 1e-9.
+        option.solver = mujoco.mjtSolver.mjSOL_CG
+        option.tolerance = 1e-6
+        option.iterations = 100
+    # What has become unstable must not be reset to a state that looks normal.
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if variant.elastic and len(body.faces):
+        option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    elif variant.elastic:
+        option.timestep = min(variant.time_step, 0.25 * largest_time_step(body))
+
+
+def _add_particle(
+    spec: Any, name: str, place: Float[np.ndarray, "3"], mass: float, side: float
+) -> None:
+    """A point mass on three slide joints; to the air it is a cube."""
+    import mujoco
+
+    inertia = [mass * side**2 / 6] * 3
+    particle = spec.worldbody.add_body(
+        name=name, pos=place, mass=mass, inertia=inertia, ipos=[0.0] * 3, explicitinertial=True
+    )
+    for axis in np.eye(3):
+        particle.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+
+
+def _set_elements(flex: Any, body: Body, variant: Variant) -> None:
+    """Triangles of a sheet or segments of a rope, and how they touch each other."""
+    import mujoco
+
+    kind = mujoco.mjtFlexSelf
+    flex.dim = 2 if len(body.faces) else 1
+    flex.elem = (body.faces if len(body.faces) else _segments(body)).ravel().tolist()
+    flex.selfcollide = kind.mjFLEXSELF_AUTO if variant.self_collision else kind.mjFLEXSELF_NONE
+
+
+def _set_sheet(flex: Any, body: Body) -> None:
+    """Elasticity of a sheet: the thickness is the one that gives both rigidities."""
+    stretch = stretch_stiffness(body, body.stiffness)
+    thickness = np.sqrt(12 * (1 - POISSON**2) * bending_rigidity(body) / stretch)
+    flex.young, flex.poisson, flex.thickness = stretch / thickness, POISSON, thickness
+    flex.damping = stretch_stiffness(body, body.damping) / stretch
+    flex.elastic2d = 3  # both stretching and bending
+
+
+def _set_rope(flex: Any, body: Body) -> None:
+    """Elasticity of a rope: springs along its segments, and bending of a round rod."""
+    segment = _length(body) / (body.num_particles - 1)
+    flex.edgestiffness = stretch_stiffness(body, body.stiffness) / segment
+    flex.edgedamping = stretch_stiffness(body, body.damping) / segment
+    flex.young = bending_rigidity(body) / (np.pi * flex.radius**4 / 4)
+
+
+def _add_picker(spec: Any, body: Body, particle: int) -> None:
+    """What grasps a particle: a mocap body, joined to it when the constraint is switched on."""
+    import mujoco
+
+    if not 0 <= particle < body.num_particles:
+        raise ValueError(
+            f"particle {particle} cannot be grasped; a body of {body.num_particles} particles has "
+            f"ids 0 to {body.num_particles - 1}"
+        )
+    name = f"picker_{particle}"
+    spec.worldbody.add_body(name=name, mocap=True, pos=body.rest[particle])
+    spec.add_equality(
+        name=name,
+        type=mujoco.mjtEq.mjEQ_CONNECT,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1=f"particle_{particle}",
+        name2=name,
+        active=False,
+        data=[0.0] * mujoco.mjNEQDATA,  # at no offset: both are made where the particle rests
+        # As stiff as the time step allows: what is held follows its picker within 0.1 mm.
+        solref=_stiffest(spec.option.timestep),
+        solimp=[0.999, 0.9999, 1e-4, 0.5, 2.0],
+    )
+
+
+def _stiffest(time_step: float) -> list[float]:
+    """Time constant, s, and damping ratio of a constraint as stiff as the time step allows.
+
+    Our contacts are rigid. A critically damped one of time constant `c` gives way by `v c / e` to
+    what hits it at a speed `v`: at 1 m/s and MuJoCo's own 20 ms by 7 mm. A layer that was laid
+    down on another, of a thickness of 4 mm, went through it at 0.3 m/s already, but not at 1.4 m/s
+    with 4 ms. What friction holds under a load creeps in proportion to `c`, too.
+    """
+    return [2 * time_step, 1.0]
+
+
+def _contact_radius(body: Body, variant: Variant) -> float:
+    """The body's radius, or less where parts that are not neighbours would always touch."""
+    return min(body.radius, 0.45 * body.spacing) if variant.self_collision else body.radius
+
+
+def _area(body: Body) -> float:
+    return float(face_areas(body.rest, body.faces).sum())
+
+
+def _length(body: Body) -> float:
+    """Of a rope along its segments, metres."""
+    return float(np.linalg.norm(np.diff(body.rest, axis=0), axis=1).sum())
+
+
+def _segments(body: Body) -> Int[np.ndarray, "M 2"]:
+    """Neighbours along a rope."""
+    ids = np.arange(body.num_particles)
+    return np.stack([ids[:-1], ids[1:]], axis=1)
+
+
+def _is_edge(body: Body) -> np.ndarray:
+    """Whether each spring is an edge of the flex, shape (S,); the others resist bending."""
+    edges = half_edges(body.faces)[0] if len(body.faces) else _segments(body)
+    count = body.num_particles
+    codes = np.sort(edges, axis=1) @ [count, 1]
+    return np.isin(np.sort(body.springs, axis=1) @ [count, 1], codes)

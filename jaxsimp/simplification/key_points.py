@@ -1,0 +1,104 @@
+"""Key points: the few particles that a goal makes worth grasping."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+class FitStatus(IntEnum):
+    """What became of the search for a goal's model."""
+
+    FITS = 0
+    NO_FIT = 1
+    INFEASIBLE = 2
+
+
+@dataclass(frozen=True, eq=False)
+class KeyPoints:
+    """The smallest model that fits a goal, as particles of the body.
+
+    A model is piecewise linear in rest coordinates: particles at `W positions`, where row `i` of
+    `W` interpolates between the key points around the rest coordinates of particle `i` (see
+    interpolation.py). That is one notion of error for ropes and surfaces; `errors` are in the
+    norm by which the method chooses.
+
+    Attributes:
+        particles: ids of the key points in ascending order, shape (K,).
+        positions: where the model has them in the goal, shape (K, 3), metres.
+        elements: the model's segments, shape (K - 1, 2), or triangles, shape (M, 3), as
+            indices into `particles`.
+        num_particles: number of particles of the body, `N`.
+        method: what found them.
+        sizes: numbers of key points tried, in ascending order: up to the first that fits, and
+            a few beyond, which show what more key points would buy.
+        errors: error of the model at each size, metres.
+        tolerance: error below which a model fits, metres.
+        max_error: largest distance of a particle from the model, metres.
+        rms_error: root mean square of those distances, metres.
+        certified: whether it is proven that no model with fewer key points fits.
+        status: `FITS`, or why no model fits. Where none of the sizes does, this is one that was
+            tried, as the method says; where constraints contradict each other there are no key
+            points.
+    """
+
+    particles: Int[np.ndarray, " K"]
+    positions: Float[np.ndarray, "K 3"]
+    elements: Int[np.ndarray, "M E"]
+    num_particles: int
+    method: str
+    sizes: tuple[int, ...]
+    errors: tuple[float, ...]
+    tolerance: float
+    max_error: float
+    rms_error: float
+    certified: bool = False
+    status: FitStatus = FitStatus.FITS
+
+    def __len__(self) -> int:
+        return len(self.particles)
+
+    @property
+    def mask(self) -> Bool[np.ndarray, " N"]:
+        """True at the particles that may be grasped: indexes the particle axis of an action."""
+        mask = np.zeros(self.num_particles, dtype=bool)
+        mask[self.particles] = True
+        return mask
+
+    @property
+    def error(self) -> float:
+        """Error of the model, metres."""
+        return self.errors[self.sizes.index(len(self))]
+
+
+SIZES_BEYOND = 3
+"""Sizes tried after the first that fits."""
+
+
+def smallest_fit(
+    error_fn: Callable[[int], float], sizes: Iterable[int], tolerance: float
+) -> tuple[int | None, dict[int, float]]:
+    """The first size whose error is below the tolerance, and the errors of all sizes tried.
+
+    Sizes are tried one by one, since errors need not fall with every further key point.
+
+    Args:
+        error_fn: error of the model of a size, metres.
+        sizes: in ascending order.
+        tolerance: metres.
+
+    Returns:
+        The size, None if no model fits, and the errors by size, `SIZES_BEYOND` further than
+        needed.
+    """
+    errors: dict[int, float] = {}
+    fitting: list[int] = []
+    for size in sizes:
+        errors[size] = error_fn(size)
+        if fitting or errors[size] < tolerance:
+            fitting.append(size)
+        if len(fitting) > SIZES_BEYOND:
+            break
+    return (fitting[0] if fitting else None), errors

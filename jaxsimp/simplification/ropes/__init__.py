@@ -1,0 +1,1 @@
+"""Ropes: chains of segments through key points."""

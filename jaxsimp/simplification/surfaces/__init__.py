@@ -1,0 +1,1 @@
+"""Surfaces: triangles between key points, for cloths, garments and meshes."""

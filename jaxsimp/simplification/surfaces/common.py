@@ -1,0 +1,166 @@
+"""What the methods for surfaces share: options, boundaries, the choice by Hausdorff distance."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsimp.bodies import Body
+from jaxsimp.bodies.meshes import half_edges
+from jaxsimp.goals import Positions, as_goal
+from jaxsimp.simplification.interpolation import interpolation_weights, model_errors
+from jaxsimp.simplification.key_points import FitStatus, KeyPoints, smallest_fit
+from jaxsimp.simplification.surfaces.hausdorff import Surface, hausdorff_distance
+
+DEFAULT_MAX_SIZE = 24
+
+
+def check_surfaces(
+    body: Body, goals: Float[np.ndarray, "B N 3"], tolerance: float, max_size: int, least: int
+) -> Float[np.ndarray, "B N 3"]:
+    """Goals as floats, if a method for surfaces can work with them and the options.
+
+    Args:
+        body: must have triangles.
+        goals: goal positions, metres, finite for each particle of this body.
+        tolerance: must be above zero, metres.
+        max_size: must be `least` or more.
+        least: the smallest model of the method.
+
+    Raises:
+        ValueError: if one of them does not.
+    """
+    if len(body.faces) == 0:
+        raise ValueError(f"the {body.name} has 0 triangles; give a body with triangles")
+    if not 0 < tolerance < np.inf:
+        raise ValueError(f"tolerance is {tolerance:g}; give a distance above zero, in metres")
+    if max_size < least:
+        raise ValueError(f"max_size is {max_size}; at least {least} is needed")
+    checked = np.zeros((len(goals), *body.rest.shape))
+    for index, goal in enumerate(goals):
+        checked[index] = as_goal(body, goal)
+    return checked
+
+
+def boundary(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, " E"]]:
+    """Edges of one triangle only, shape (E, 2), as they run in it, and that triangle, shape (E,).
+
+    Args:
+        faces: vertex ids of the triangles, shape (F, 3).
+    """
+    edges, _ = half_edges(faces)
+    _, index, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    alone = index[count == 1]
+    return edges[alone], alone % len(faces)
+
+
+def inner_edges(
+    faces: Int[np.ndarray, "F 3"],
+) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "E 2"], Int[np.ndarray, "E 2"]]:
+    """Edges of two triangles, the vertices opposite to them, and the triangles, (E, 2) each.
+
+    An edge runs as in its first triangle.
+
+    Args:
+        faces: vertex ids of the triangles, shape (F, 3).
+    """
+    edges, opposite = half_edges(faces)
+    _, where, count = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    order = np.argsort(where, kind="stable")
+    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
+    return edges[pairs[:, 0]], opposite[pairs], pairs % len(faces)
+
+
+def fewest_vertices(
+    body: Body,
+    goal: Positions,
+    meshes: Mapping[int, Int[np.ndarray, "_ 3"]],
+    sizes: Iterable[int],
+    tolerance: float,
+    method: str,
+) -> KeyPoints:
+    """Of meshes with vertices among the particles, the smallest that covers the goal.
+
+    The error is the Hausdorff distance, surface to surface, from samples that are a tenth of the
+    tolerance apart, or an eighth of the body's spacing if that is more: it may be below the true
+    distance by 0.58 of that.
+
+    Args:
+        body: a body with triangles.
+        goal: goal positions, shape (N, 3), metres.
+        meshes: triangles in particle ids by number of vertices; looked up as `sizes` go.
+        sizes: numbers of vertices in ascending order.
+        tolerance: Hausdorff distance below which a mesh fits, metres.
+        method: what made the meshes.
+
+    Returns:
+        The first mesh that fits; else the status is `NO_FIT` and it is the best of them, which is
+        no key point at all with an infinite error where there are no meshes.
+    """
+    original = Surface(goal, body.faces)
+    sampling = max(tolerance / 10, body.spacing / 8)
+
+    def error(size: int) -> float:
+        return hausdorff_distance(original, Surface(goal, meshes[size]), sampling)
+
+    size, errors = smallest_fit(error, sizes, tolerance)
+    if not errors:
+        return no_model(body, tolerance, method)
+    best = min(errors, key=errors.__getitem__) if size is None else size
+    particles, elements = np.unique(meshes[best], return_inverse=True)
+    elements = elements.reshape(-1, 3)
+    weights = interpolation_weights(body.rest, particles, elements)
+    largest, mean = model_errors(goal, weights, goal[particles])
+    return KeyPoints(
+        particles=particles,
+        positions=goal[particles],
+        elements=elements,
+        num_particles=body.num_particles,
+        method=method,
+        sizes=tuple(errors),
+        errors=tuple(errors.values()),
+        tolerance=tolerance,
+        max_error=largest,
+        rms_error=mean,
+        status=FitStatus.NO_FIT if size is None else FitStatus.FITS,
+    )
+
+
+def no_model(body: Body, tolerance: float, method: str) -> KeyPoints:
+    """What a method returns if it has no model at all: no key point, and an infinite error.
+
+    Args:
+        body: a body with triangles.
+        tolerance: error below which a model would fit, metres.
+        method: what found none.
+    """
+    return KeyPoints(
+        particles=np.zeros(0, dtype=int),
+        positions=np.zeros((0, 3)),
+        elements=np.zeros((0, 3), dtype=int),
+        num_particles=body.num_particles,
+        method=method,
+        sizes=(0,),
+        errors=(np.inf,),
+        tolerance=tolerance,
+        max_error=np.inf,
+        rms_error=np.inf,
+        status=FitStatus.NO_FIT,
+    )
+
+
+def rest_normals(
+    rest: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
+    """Normals of triangles at rest, as long as the triangles are large, shape (F, 3).
+
+    Args:
+        rest: rest coordinates, shape (N, 3), metres.
+        faces: vertex ids of the triangles, shape (F, 3).
+    """
+    first, second = np.moveaxis(rest[faces[:, 1:]] - rest[faces[:, :1]], 1, 0)
+    return np.cross(first, second) / 2
