@@ -53,8 +53,8 @@ class SelfContact:
         lateral: particles touch that are not farther apart along their layers, metres.
         margin: how far is looked beyond what touches, metres.
         slack: how far one that touches may move until contacts are looked up again, metres.
-        squash: how much larger than across the sheet distances along it may be: a particle is above
-            another where `across^2 (1 + squash)` exceeds the square of their distance.
+        squash: weight that the squared distance across a sheet has on top of 1, where the nearest
+            particle is looked for: `|d|^2 + squash across^2`.
         friction: Coulomb coefficient between layers.
         is_sheet: or else a rope, static.
         interval: time steps from contact to contact, static.
