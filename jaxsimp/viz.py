@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body
-from jaxsimp.bodies.meshes import boundary_edges
+from jaxsimp.bodies.topology import boundary_edges
 from jaxsimp.simplification import FitStatus, KeyPoints
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> N
         )
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-        outline = positions[boundary_edges(body.faces)]
+        outline = positions[boundary_edges(body.faces)[0]]
         if len(outline):  # a closed surface has none
             axes.add_collection3d(Line3DCollection(outline, colors="black", linewidths=0.6))
     else:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.bodies.meshes import clean_mesh, face_areas, spring_weights
+from jaxsimp.bodies.topology import chain, distinct_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +152,7 @@ def rope_along(
         ValueError: if a number is out of its range, or particles joined by a spring coincide.
     """
     _require_count("num_particles", len(points), 2)
-    ids = np.arange(len(points))
-    stretch = np.stack([ids[:-1], ids[1:]], axis=1)
-    bend = np.stack([ids[:-2], ids[2:]], axis=1)
+    stretch, bend = chain(len(points)), chain(len(points), 2)
     return _mass_spring(
         "rope",
         _on_the_table(points),
@@ -374,7 +373,7 @@ def _check_arrays(body: Body) -> None:
                 f"{name} names particle {ids.max() if ids.max() >= count else ids.min()}; "
                 f"a body of {count} particles has ids 0 to {count - 1}"
             )
-    pairs, times = np.unique(np.sort(body.springs, axis=1), axis=0, return_counts=True)
+    pairs, _, times = distinct_edges(body.springs)
     for fault, bad in (
         ("joins a particle to itself", pairs[:, 0] == pairs[:, 1]),
         ("is there twice", times > 1),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jaxsimp import goals
 from jaxsimp.bodies import cloth
 from jaxsimp.bodies.garments import t_shirt, trousers
-from jaxsimp.bodies.meshes import half_edges
+from jaxsimp.bodies.topology import half_edges
 from jaxsimp.goals.flatten import flatten
 from jaxsimp.simplification import simplify
 

@@ -13,11 +13,12 @@ from scipy.spatial.transform import Rotation
 from experiments.ideal_goals import FOLDS, NOISES, add_noise, ideal_goal, is_right
 from jaxsimp import goals
 from jaxsimp.bodies import body
+from jaxsimp.bodies.topology import boundary_edges
 from jaxsimp.simplification import simplify, simplify_meshlab, simplify_quadric
 from jaxsimp.simplification.interpolation import interpolation_weights
 from jaxsimp.simplification.key_points import FitStatus
 from jaxsimp.simplification.surfaces import parametric
-from jaxsimp.simplification.surfaces.common import boundary, rest_normals
+from jaxsimp.simplification.surfaces.common import rest_normals
 from jaxsimp.simplification.surfaces.parametric import simplify_parametric
 
 ROUNDING = 1e-9  # metres, of sums over some hundred particles of a sheet of 0.3 m
@@ -166,7 +167,7 @@ def test_models_of_every_size_are_discs_that_cover_the_sheet(seed):
     for size, model in models.items():
         faces = model.vertices[model.triangles]
         assert size == len(model.vertices) == len(np.unique(faces))
-        edges, _ = boundary(faces)
+        edges, _ = boundary_edges(faces)
         assert len(faces) == 2 * size - 2 - len(edges)  # Euler: a disc
         areas = signed_areas(sheet.rest, faces)
         assert areas.min() > 0
@@ -285,7 +286,7 @@ def test_a_closed_surface_stays_closed_down_to_four_points():
 def test_two_sides_that_coincide_at_rest_are_kept_apart():
     """A pillow: two sheets sewn at their rims, at rest upon each other; the upper one is lifted."""
     sheet = cloth(9)
-    rim = np.unique(boundary(sheet.faces)[0])
+    rim = np.unique(boundary_edges(sheet.faces)[0])
     inner = np.setdiff1d(np.arange(81), rim)
     upper = np.arange(81)
     upper[inner] = 81 + np.arange(len(inner))
