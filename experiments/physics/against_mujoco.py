@@ -1,7 +1,7 @@
 """The same cloth in ours and as a flex of MuJoCo: hanging at rest, and folded by the same plan."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -90,12 +90,12 @@ def ways_to_hang(body: Body) -> dict[str, Hanging]:
 
 def stiffened(body: Body, factor: float) -> Body:
     """A body whose springs are stiffer, and damped in the same proportion to critical."""
-    return replace(body, stiffness=factor * body.stiffness, damping=np.sqrt(factor) * body.damping)
+    return body.scaled(stiffness=factor, damping=float(np.sqrt(factor)))
 
 
 def hung(body: Body, seconds: float) -> dict[str, dict[str, Positions]]:
     """Positions by the way it hangs, and by the engine; in air that slows it five times as much."""
-    slowed = replace(body, drag=5 * body.drag)
+    slowed = body.scaled(drag=5.0)
     return {
         name: {
             OURS: hang(slowed, way.start, way.held, seconds),

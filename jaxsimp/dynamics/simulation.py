@@ -119,8 +119,8 @@ def make_simulation(
         rest=array(body.rest),
         mass=array(body.mass),
         radius=array(body.radius),
-        drag=array(body.drag),
-        friction=array(body.friction),
+        drag=array(body.material.drag),
+        friction=array(body.material.friction),
         gravity=array(gravity),
         time_step=array(time_step),
         self_contact=(
@@ -150,7 +150,7 @@ def largest_time_step(body: Body) -> float:
     half the step is safe for it.
     """
     k = _largest_eigenvalue(body, body.stiffness)
-    c = _largest_eigenvalue(body, body.damping) + body.drag
+    c = _largest_eigenvalue(body, body.damping) + body.material.drag
     # The positive root of k dt^2 + 2 c dt - 4 = 0, in a form that allows k = 0; it is
     # never beyond 2 / c.
     denominator = c + np.sqrt(c**2 + 4 * k)

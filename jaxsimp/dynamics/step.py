@@ -152,8 +152,7 @@ def _constrained(
     height: Float[Array, "N *B"],
 ) -> Axes:
     """Velocities after contact and pickers."""
-    above = height - simulation.radius
-    moved = table_contact(above, free, simulation.friction, simulation.time_step)
+    moved = table_contact(simulation, height, free)
     return [jnp.where(held, drive[axis] * share, moved[axis]) for axis in range(3)]
 
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsimp.bodies import Body
 from jaxsimp.dynamics import Actions, Pickers, Simulation
 from jaxsimp.tasks import Episode, Task
 
@@ -183,28 +182,8 @@ def _member(task: Task, factors: dict[str, float]) -> Task:
     """The task with a body of other physics; its longest time step has the factor, too."""
     return dataclasses.replace(
         task,
-        body=scaled_body(task.body, **{k: v for k, v in factors.items() if k != "time_step"}),
+        body=task.body.scaled(**{k: v for k, v in factors.items() if k != "time_step"}),
         longest_time_step=task.longest_time_step * factors["time_step"],
-    )
-
-
-def scaled_body(
-    body: Body,
-    *,
-    stiffness: float = 1.0,
-    damping: float = 1.0,
-    drag: float = 1.0,
-    friction: float = 1.0,
-    mass: float = 1.0,
-) -> Body:
-    """The body with its physics times factors."""
-    return dataclasses.replace(
-        body,
-        stiffness=stiffness * body.stiffness,
-        damping=damping * body.damping,
-        drag=drag * body.drag,
-        friction=friction * body.friction,
-        mass=mass * body.mass,
     )
 
 

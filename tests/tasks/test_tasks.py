@@ -343,7 +343,7 @@ def test_a_crumpled_rope_is_not_overstretched_and_not_straight(crumpled):
     body, shapes = crumpled
     # At rest on the table friction holds a tension of at most mu m g: with the 150 N/m of a
     # spring between neighbours that is 0.65 mm.
-    allowed = body.friction * body.mass.sum() * 9.81 / 150.0
+    allowed = body.material.friction * body.mass.sum() * 9.81 / 150.0
     for position in shapes:
         lengths = np.linalg.norm(np.diff(position, axis=0), axis=1)
         assert np.all(lengths <= body.spacing + allowed)

@@ -96,12 +96,12 @@ def make_self_contact(
         ValueError: if the body has no thickness, pickers are too fast for it, or a number is out
             of its range.
     """
-    thickness = 2 * body.radius
+    thickness = body.material.thickness
     if not thickness > 0:
-        raise ValueError("radius is 0; self-contact needs a body of some thickness: give a radius")
+        raise ValueError("thickness is 0; self-contact needs layers of some: give one above zero")
     if interval < 1:
         raise ValueError(f"interval is {interval}; contact acts after at least 1 time step")
-    friction = body.friction if friction is None else friction
+    friction = body.material.friction if friction is None else friction
     if not 0 <= friction < np.inf:
         raise ValueError(f"friction is {friction}; give a finite number, zero or more")
     seconds = interval * time_step
@@ -113,7 +113,7 @@ def make_self_contact(
             f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "
             f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s when contact "
             f"acts every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a "
-            f"smaller time step or interval, or a larger radius; or leave self-contact out"
+            f"smaller time step or interval, or a larger thickness; or leave self-contact out"
         )
     covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxsimp.bodies import Body
-from jaxsimp.dynamics import Actions, Pickers, State, make_simulation
+from jaxsimp.dynamics import Actions, Pickers, Simulation, State, make_simulation
 from jaxsimp.dynamics.contact.table import table_contact
 from jaxsimp.dynamics.pickers import grasp, speed_profile
 from jaxsimp.engines.mjx.tendons import tendon_spec
@@ -32,7 +32,7 @@ takes about fifty times as long as our own for a rope of 11, a thousand times fo
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["model", "data", "rest", "radius", "friction"],
+    data_fields=["model", "data", "ours"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -42,16 +42,12 @@ class MJXSimulation:
     Attributes:
         model: a `mujoco.mjx.Model`.
         data: a `mujoco.mjx.Data` to put states into.
-        rest: rest coordinates, shape (N, 3), metres.
-        radius: height of a particle that lies on the table, metres.
-        friction: Coulomb coefficient with the table.
+        ours: the body's simulation in our dynamics, for our table and pickers.
     """
 
     model: Any
     data: Any
-    rest: Float[Array, "... N 3"]
-    radius: Float[Array, "..."]
-    friction: Float[Array, "..."]
+    ours: Simulation
 
     @property
     def time_step(self) -> Float[Array, "..."]:
@@ -81,9 +77,7 @@ def make_mjx_simulation(
         )
     ours = make_simulation(body, time_step, gravity)
     model = to_mjx(tendon_spec(body, time_step, gravity).compile())
-    return MJXSimulation(
-        model, _mjx().make_data(model, impl="jax"), ours.rest, ours.radius, ours.friction
-    )
+    return MJXSimulation(model, _mjx().make_data(model, impl="jax"), ours)
 
 
 def to_mjx(model: Any) -> Any:
@@ -133,9 +127,8 @@ def mjx_rollout(
     """Carry out a plan in MJX: arguments and result as of `jaxsimp.dynamics.rollout`."""
 
     def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:
-        held, displacement = grasp(
-            pickers, simulation.rest, simulation.radius, state.position, action
-        )
+        ours = simulation.ours
+        held, displacement = grasp(pickers, ours.rest, ours.radius, state.position, action)
         drive = displacement / simulation.time_step
 
         def one(state: State, share: Float[Array, ""]) -> tuple[State, None]:
@@ -155,8 +148,7 @@ def _step(
 ) -> State:
     """A step of MJX with velocities after contact; held particles have those of `carried`."""
     free = _free_step(simulation, state)[0].velocity
-    above = state.position[:, 2] - simulation.radius
-    touched = table_contact(above, list(free.T), simulation.friction, simulation.time_step)
+    touched = table_contact(simulation.ours, state.position[:, 2], list(free.T))
     velocity = jnp.where(held[:, None], carried, jnp.stack(touched, axis=1))
     return State(state.position + simulation.time_step * velocity, velocity)
 

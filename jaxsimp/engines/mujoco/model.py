@@ -164,7 +164,7 @@ def _spec(body: Body, variant: Variant, graspable: Iterable[int], table: bool) -
         _add_particle(spec, name, place, float(mass), SIDE * float(mass / body.mass.mean()))
     radius = _contact_radius(body, variant)
     contact = {
-        "friction": [body.friction, 0.0, 0.0],
+        "friction": [body.material.friction, 0.0, 0.0],
         "condim": 3,
         "solref": _stiffest(spec.option.timestep),
     }
@@ -199,7 +199,7 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
 
     option = spec.option
     # A cube of side s in air of this viscosity feels the force 3 pi s viscosity v.
-    option.viscosity = body.drag * float(body.mass.mean()) / (3 * np.pi * SIDE)
+    option.viscosity = body.material.drag * float(body.mass.mean()) / (3 * np.pi * SIDE)
     option.gravity = [0.0, 0.0, -GRAVITY]
     option.timestep = variant.time_step
     # Friction is the same in all directions, as ours is.
