@@ -265,7 +265,7 @@ def test_strands_of_a_crossed_rope_lie_on_each_other_only_in_full():
 def two_sheets():
     """Two square sheets of 9 x 9 particles, side by side, in one body."""
     sheet = cloth((9, 9), (0.1, 0.1), mass=0.002)
-    twice = ("mass", "rest_length", "stiffness", "damping")
+    twice = ("mass", "families", "rest_length", "stiffness", "damping")
     return dataclasses.replace(
         sheet,
         rest=np.concatenate([sheet.rest, sheet.rest + np.array([0.0, 0.2, 0.0])]),
