@@ -207,7 +207,8 @@ def _plan_cost(
     physics, episode = shared
 
     def step_cost(state: State) -> Float[Array, ""]:
-        return task.cost_fn(episode, state.position)
+        # An engine's observation does not see the action yet: that of the first stands for it.
+        return task.running_cost(episode, state, jax.tree.map(lambda array: array[0], actions))
 
     start = at_rest(episode.start)
     _, costs = engine.rollout(physics, start, _then_idle(actions, 1), step_cost)

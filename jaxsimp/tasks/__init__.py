@@ -14,13 +14,14 @@ from jaxsimp.tasks import cloth
 from jaxsimp.tasks import garments
 
 # isort: split
-from jaxsimp.tasks.costs import distance_cost, matching_cost, matching_distance
+from jaxsimp.tasks.costs import MatchingCost, distance_cost, matching_distance
 from jaxsimp.tasks.crumple import crumple
 from jaxsimp.tasks.task import (
-    CostFn,
     Episode,
+    RunningCost,
     Task,
     TaskFactory,
+    TerminalCost,
     make_task,
     register,
     score,
@@ -28,16 +29,17 @@ from jaxsimp.tasks.task import (
 )
 
 __all__ = [
-    "CostFn",
     "Episode",
+    "MatchingCost",
+    "RunningCost",
     "Task",
     "TaskFactory",
+    "TerminalCost",
     "cloth",
     "crumple",
     "distance_cost",
     "garments",
     "make_task",
-    "matching_cost",
     "matching_distance",
     "register",
     "rope",

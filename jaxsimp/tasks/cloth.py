@@ -1,16 +1,45 @@
 """Tasks of cloths: the two folds of the paper, after SoftGym and fabric-vsf, and more."""
 
+from dataclasses import dataclass
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
+from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.costs import distance, distance_cost
 from jaxsimp.tasks.task import Episode, Task, register
 
 STILL_WEIGHT = 1.2
 """Weight of the displacement of the half that should lie still, after SoftGym."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoldCost:
+    """Cost of a fold in half: `mean |a_i - b_i| + 1.2 mean |b_i - b_i(0)|`, metres.
+
+    `a` is the moving half and `b` its mirror image in the half that should lie still, as in
+    SoftGym.
+
+    Attributes:
+        moving: ids of the particles of the moving half, shape (M,).
+        still: ids of their mirror images, shape (M,).
+    """
+
+    moving: Int[np.ndarray, " M"]
+    still: Int[np.ndarray, " M"]
+
+    def __call__(
+        self, episode: Episode, state: State, action: Actions | None = None
+    ) -> Float[Array, ""]:
+        """The cost of a state, metres."""
+        position = state.position
+        apart = distance(position[self.moving] - position[self.still]).mean()
+        start = jnp.asarray(episode.start)[self.still]
+        dragged = distance(position[self.still] - start).mean()
+        return apart + STILL_WEIGHT * dragged
 
 
 @register("cloth_side_folding", full=25, quick=9, group="paper")
@@ -36,31 +65,29 @@ def cloth_diagonal_folding(resolution: int) -> Task:
 def _fold_task(
     name: str, body: Body, direction: tuple[float, float], moving: np.ndarray, mirror: np.ndarray
 ) -> Task:
-    """A fold about a line through the middle.
+    """A fold about a line through the middle, from a flat start turned at random (see `FoldCost`).
 
-    The cost is `mean |a_i - b_i| + 1.2 mean |b_i - b_i(0)|`, with `a` the moving half and `b`
-    its mirror image in the half that should lie still. The start is flat, turned at random
-    within 45 degrees, as in SoftGym.
+    Args:
+        name: of the task.
+        body: a square cloth.
+        direction: x and y of the line's direction.
+        moving: ids of the particles of the moving half, shape (M,).
+        mirror: id of the mirror image of each particle, shape (N,).
     """
-    still = mirror[moving]
-    line = np.zeros(2), np.array(direction)
-
-    def cost(episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-        apart = distance(position[moving] - position[still]).mean()
-        dragged = distance(position[still] - jnp.asarray(episode.start)[still]).mean()
-        return apart + STILL_WEIGHT * dragged
+    cost = FoldCost(moving, mirror[moving])
 
     def episode(seed: int) -> Episode:
         angle = random_angle(seed)
         return Episode(goals.flat(body, angle), goals.turn(goal, angle))
 
-    goal = goals.fold(body, goals.flat(body), *line)
+    goal = goals.fold(body, goals.flat(body), np.zeros(2), np.array(direction))
     return Task(
         name=name,
         body=body,
         goal=goal,
         episode_fn=episode,
-        cost_fn=cost,
+        running_cost=cost,
+        terminal_cost=cost,
         limits=(0.2, 0.2, 0.2),
         num_actions=2,
         action_seconds=0.25,
@@ -105,7 +132,8 @@ def flat_task(name: str, body: Body, goal: goals.Positions, num_actions: int) ->
         body=body,
         goal=goal,
         episode_fn=episode,
-        cost_fn=distance_cost,
+        running_cost=distance_cost,
+        terminal_cost=distance_cost,
         limits=(0.2, 0.2, 0.2),
         num_actions=num_actions,
         action_seconds=0.25,

@@ -6,7 +6,8 @@ from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body, rope
-from jaxsimp.tasks.costs import distance, distance_cost, matching_cost
+from jaxsimp.dynamics import Actions, State
+from jaxsimp.tasks.costs import MatchingCost, distance, distance_cost
 from jaxsimp.tasks.crumple import crumple
 from jaxsimp.tasks.task import Episode, Task, register
 
@@ -17,19 +18,23 @@ ROPE_LIMITS = (0.15, 0.15, 0.15)
 """Largest displacement of one action along x, y, z, metres."""
 
 
+def ends_cost(episode: Episode, state: State, action: Actions | None = None) -> Float[Array, ""]:
+    """Difference, metres, between the distance of a rope's ends and their distance in the goal.
+
+    `abs(|p_1 - p_N| - L)`, with `L` the distance of the ends in the goal, as in SoftGym.
+    """
+    position, goal = state.position, jnp.asarray(episode.goal)
+    return jnp.abs(distance(position[0] - position[-1]) - distance(goal[0] - goal[-1]))
+
+
 @register("rope_straightening", full=41, quick=21, group="paper")
 def rope_straightening(resolution: int) -> Task:
-    """Pull a crumpled rope straight: cost `abs(|p_1 - p_N| - L)`, as in SoftGym.
+    """Pull a crumpled rope straight, as in SoftGym; the goal is slack.
 
-    `L` is the length of the slack straight goal; the start is a straight rope after four
-    random picks (see `crumple`).
+    The start is a straight rope after four random picks (see `crumple`); the cost is `ends_cost`.
     """
     body = rope(resolution, ROPE_LENGTH)
     goal = goals.straight(body, SLACK * body.size)
-
-    def cost(episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-        goal = jnp.asarray(episode.goal)
-        return jnp.abs(distance(position[0] - position[-1]) - distance(goal[0] - goal[-1]))
 
     return Task(
         name="rope_straightening",
@@ -37,7 +42,8 @@ def rope_straightening(resolution: int) -> Task:
         goal=goal,
         limits=ROPE_LIMITS,
         episode_fn=lambda seed: Episode(crumple(body, seed), goal),
-        cost_fn=cost,
+        running_cost=ends_cost,
+        terminal_cost=ends_cost,
     )
 
 
@@ -54,14 +60,15 @@ def rope_folding(resolution: int) -> Task:
     corners = np.array([[-side / 2, -height / 2], [0.0, height / 2], [side / 2, -height / 2]])
     goal = goals.polyline(body, corners)
     start = goals.straight(body)
-
+    cost = MatchingCost(resolution)
     return Task(
         name="rope_folding",
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
         episode_fn=lambda seed: Episode(start, goal),
-        cost_fn=matching_cost(resolution),
+        running_cost=cost,
+        terminal_cost=cost,
     )
 
 
@@ -95,6 +102,7 @@ def _shape_task(name: str, body: Body, goal: goals.Positions) -> Task:
         goal=goal,
         limits=ROPE_LIMITS,
         episode_fn=lambda seed: Episode(start, goal),
-        cost_fn=distance_cost,
+        running_cost=distance_cost,
+        terminal_cost=distance_cost,
         num_actions=6,
     )

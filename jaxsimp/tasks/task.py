@@ -5,15 +5,17 @@ from dataclasses import dataclass
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
 from jaxsimp.dynamics import (
+    Actions,
     Pickers,
     Simulation,
+    State,
+    at_rest,
     largest_time_step,
     make_pickers,
     make_simulation,
@@ -29,8 +31,10 @@ class Episode:
     goal: Float[Array | np.ndarray, "N 3"]
 
 
-CostFn = Callable[[Episode, Float[Array, "N 3"]], Float[Array, ""]]
-"""Cost of positions in an episode; pure JAX."""
+RunningCost = Callable[[Episode, State, Actions], Float[Array, ""]]
+"""Cost of the state at the end of an action, and of that action, shapes (G,) and (G, 3)."""
+TerminalCost = Callable[[Episode, State], Float[Array, ""]]
+"""Cost of the settled state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +46,9 @@ class Task:
         body: what is manipulated.
         goal: the goal configuration that key points are found in, shape (N, 3), metres.
         episode_fn: from a seed to start and goal.
-        cost_fn: cost of positions in an episode, a scalar; pure JAX.
+        running_cost: cost of an episode, the state at the end of an action, and that action,
+            shapes (G,) and (G, 3): a scalar, at least 0; pure JAX.
+        terminal_cost: cost of an episode and the settled state: a scalar, at least 0; pure JAX.
         limits: largest displacement of one action along x, y, z, metres.
         num_actions: actions in a plan, `T`.
         num_pickers: `G`.
@@ -56,7 +62,8 @@ class Task:
     body: Body
     goal: Float[np.ndarray, "N 3"]
     episode_fn: Callable[[int], Episode]
-    cost_fn: CostFn
+    running_cost: RunningCost
+    terminal_cost: TerminalCost
     limits: tuple[float, float, float]
     num_actions: int = 4
     num_pickers: int = 2
@@ -100,10 +107,21 @@ class Task:
         return round(self.action_seconds / self.time_step)
 
 
-def score(task: Task, episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-    """Normalised score `(c_0 - c) / c_0`: 1 at the goal, 0 for a state as good as the start."""
-    start = task.cost_fn(episode, jnp.asarray(episode.start))
-    return (start - task.cost_fn(episode, position)) / start
+def score(
+    task: Task, episode: Episode, state: State | Float[Array | np.ndarray, "N 3"]
+) -> Float[Array, ""]:
+    """Normalised score `(c_0 - c) / c_0`: 1 where the cost is 0, 0 where it is that of the start.
+
+    `c_0` and `c` are terminal costs of the start, at rest, and of the state.
+
+    Args:
+        task: what is asked.
+        episode: start and goal.
+        state: that is scored, or its positions, shape (N, 3), metres, at rest.
+    """
+    state = state if isinstance(state, State) else at_rest(state)
+    start = task.terminal_cost(episode, at_rest(episode.start))
+    return (start - task.terminal_cost(episode, state)) / start
 
 
 TaskFactory = Callable[[int], Task]
