@@ -10,6 +10,7 @@ from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.costs import distance, distance_cost
+from jaxsimp.tasks.starts import TurnedStart
 from jaxsimp.tasks.task import Episode, Task, register
 
 STILL_WEIGHT = 1.2
@@ -76,16 +77,12 @@ def _fold_task(
     """
     cost = FoldCost(moving, mirror[moving])
 
-    def episode(seed: int) -> Episode:
-        angle = random_angle(seed)
-        return Episode(goals.flat(body, angle), goals.turn(goal, angle))
-
     goal = goals.fold(body, goals.flat(body), np.zeros(2), np.array(direction))
     return Task(
         name=name,
         body=body,
         goal=goal,
-        episode_fn=episode,
+        episode_fn=TurnedStart(body, goal),
         running_cost=cost,
         terminal_cost=cost,
         limits=(0.2, 0.2, 0.2),
@@ -122,24 +119,14 @@ def flat_task(name: str, body: Body, goal: goals.Positions, num_actions: int) ->
 
     The cost is the mean distance of the particles to their goals.
     """
-
-    def episode(seed: int) -> Episode:
-        angle = random_angle(seed)
-        return Episode(goals.flat(body, angle), goals.turn(goal, angle))
-
     return Task(
         name=name,
         body=body,
         goal=goal,
-        episode_fn=episode,
+        episode_fn=TurnedStart(body, goal),
         running_cost=distance_cost,
         terminal_cost=distance_cost,
         limits=(0.2, 0.2, 0.2),
         num_actions=num_actions,
         action_seconds=0.25,
     )
-
-
-def random_angle(seed: int) -> float:
-    """Of a flat start, radians, within 45 degrees, as in SoftGym."""
-    return np.random.default_rng(seed).uniform(-np.pi / 4, np.pi / 4)

@@ -8,7 +8,7 @@ from jaxsimp import goals
 from jaxsimp.bodies import Body, rope
 from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.costs import MatchingCost, distance, distance_cost
-from jaxsimp.tasks.crumple import crumple
+from jaxsimp.tasks.starts import CrumpledStart, FixedStart
 from jaxsimp.tasks.task import Episode, Task, register
 
 ROPE_LENGTH = 0.5375
@@ -41,7 +41,7 @@ def rope_straightening(resolution: int) -> Task:
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=lambda seed: Episode(crumple(body, seed), goal),
+        episode_fn=CrumpledStart(body, goal),
         running_cost=ends_cost,
         terminal_cost=ends_cost,
     )
@@ -59,14 +59,13 @@ def rope_folding(resolution: int) -> Task:
     height = np.sqrt(3) / 2 * side
     corners = np.array([[-side / 2, -height / 2], [0.0, height / 2], [side / 2, -height / 2]])
     goal = goals.polyline(body, corners)
-    start = goals.straight(body)
     cost = MatchingCost(resolution)
     return Task(
         name="rope_folding",
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=lambda seed: Episode(start, goal),
+        episode_fn=FixedStart(Episode(goals.straight(body), goal)),
         running_cost=cost,
         terminal_cost=cost,
     )
@@ -95,13 +94,12 @@ def rope_crossed_triangle(resolution: int) -> Task:
 
 def _shape_task(name: str, body: Body, goal: goals.Positions) -> Task:
     """A goal from a straight start; the cost is the mean distance of particles to their goals."""
-    start = goals.straight(body)
     return Task(
         name=name,
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=lambda seed: Episode(start, goal),
+        episode_fn=FixedStart(Episode(goals.straight(body), goal)),
         running_cost=distance_cost,
         terminal_cost=distance_cost,
         num_actions=6,
