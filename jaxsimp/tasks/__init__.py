@@ -16,25 +16,20 @@ from jaxsimp.tasks import garments
 # isort: split
 from jaxsimp.tasks.costs import MatchingCost, distance_cost, matching_distance
 from jaxsimp.tasks.crumple import crumple
-from jaxsimp.tasks.task import (
-    Episode,
-    RunningCost,
-    Task,
-    TaskFactory,
-    TerminalCost,
-    make_task,
-    register,
-    score,
-    task_names,
-)
+from jaxsimp.tasks.registry import TaskFactory, make_task, register, task_names
+from jaxsimp.tasks.starts import CrumpledStart, FixedStart, TurnedStart
+from jaxsimp.tasks.task import Episode, RunningCost, Task, TerminalCost, score
 
 __all__ = [
+    "CrumpledStart",
     "Episode",
+    "FixedStart",
     "MatchingCost",
     "RunningCost",
     "Task",
     "TaskFactory",
     "TerminalCost",
+    "TurnedStart",
     "cloth",
     "crumple",
     "distance_cost",

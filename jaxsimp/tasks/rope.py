@@ -8,8 +8,9 @@ from jaxsimp import goals
 from jaxsimp.bodies import Body, rope
 from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.costs import MatchingCost, distance, distance_cost
+from jaxsimp.tasks.registry import register
 from jaxsimp.tasks.starts import CrumpledStart, FixedStart
-from jaxsimp.tasks.task import Episode, Task, register
+from jaxsimp.tasks.task import Episode, Task
 
 ROPE_LENGTH = 0.5375
 """Rest length of SoftGym's rope, metres; the straight goal is `SLACK` of it long."""
@@ -27,7 +28,7 @@ def ends_cost(episode: Episode, state: State, action: Actions | None = None) -> 
     return jnp.abs(distance(position[0] - position[-1]) - distance(goal[0] - goal[-1]))
 
 
-@register("rope_straightening", full=41, quick=21, group="paper")
+@register(full=41, quick=21, group="paper")
 def rope_straightening(resolution: int) -> Task:
     """Pull a crumpled rope straight, as in SoftGym; the goal is slack.
 
@@ -37,7 +38,6 @@ def rope_straightening(resolution: int) -> Task:
     goal = goals.straight(body, SLACK * body.size)
 
     return Task(
-        name="rope_straightening",
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
@@ -47,7 +47,7 @@ def rope_straightening(resolution: int) -> Task:
     )
 
 
-@register("rope_folding", full=41, quick=21, group="paper")
+@register(full=41, quick=21, group="paper")
 def rope_folding(resolution: int) -> Task:
     """Lay a straight rope along two sides of an equilateral triangle, its corner at the middle.
 
@@ -61,7 +61,6 @@ def rope_folding(resolution: int) -> Task:
     goal = goals.polyline(body, corners)
     cost = MatchingCost(resolution)
     return Task(
-        name="rope_folding",
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
@@ -71,31 +70,30 @@ def rope_folding(resolution: int) -> Task:
     )
 
 
-@register("rope_letter_m", full=41, quick=21, group="goals")
+@register(full=41, quick=21, group="goals")
 def rope_letter_m(resolution: int) -> Task:
     """Lay a straight rope as an M."""
     body = rope(resolution, ROPE_LENGTH)
-    return _shape_task("rope_letter_m", body, goals.letter(body, "M"))
+    return _shape_task(body, goals.letter(body, "M"))
 
 
-@register("rope_letter_u", full=41, quick=21, group="goals")
+@register(full=41, quick=21, group="goals")
 def rope_letter_u(resolution: int) -> Task:
     """Lay a straight rope as a U, its bow round."""
     body = rope(resolution, ROPE_LENGTH)
-    return _shape_task("rope_letter_u", body, goals.letter(body, "U"))
+    return _shape_task(body, goals.letter(body, "U"))
 
 
-@register("rope_crossed_triangle", full=41, quick=21, group="goals")
+@register(full=41, quick=21, group="goals")
 def rope_crossed_triangle(resolution: int) -> Task:
     """Lay a straight rope as a triangle whose two ends cross and go on."""
     body = rope(resolution, ROPE_LENGTH)
-    return _shape_task("rope_crossed_triangle", body, goals.crossed_triangle(body))
+    return _shape_task(body, goals.crossed_triangle(body))
 
 
-def _shape_task(name: str, body: Body, goal: goals.Positions) -> Task:
+def _shape_task(body: Body, goal: goals.Positions) -> Task:
     """A goal from a straight start; the cost is the mean distance of particles to their goals."""
     return Task(
-        name=name,
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,

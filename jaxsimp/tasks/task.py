@@ -1,4 +1,4 @@
-"""What a task is, how states are scored, and the registry of tasks."""
+"""What a task is, and how states are scored."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -42,7 +42,6 @@ class Task:
     """What is asked of a planner.
 
     Attributes:
-        name: in the registry.
         body: what is manipulated.
         goal: the goal configuration that key points are found in, shape (N, 3), metres.
         episode_fn: from a seed to start and goal.
@@ -56,9 +55,10 @@ class Task:
         settle_actions: as many times `action_seconds` pass, with nothing held, after the
             last action and before the plan is scored.
         longest_time_step: bound on the time step of the simulation, seconds.
+        name: of a registered task that of its factory, see `register`.
+        resolution: that a registered task was made with, see `make_task`; None of another one.
     """
 
-    name: str
     body: Body
     goal: Float[np.ndarray, "N 3"]
     episode_fn: Callable[[int], Episode]
@@ -70,6 +70,8 @@ class Task:
     action_seconds: float = 0.3
     settle_actions: int = 4
     longest_time_step: float = 2e-3
+    name: str = "unnamed"
+    resolution: int | None = None
 
     def __post_init__(self) -> None:
         goals.check_goal(self.body, self.goal)
@@ -122,59 +124,3 @@ def score(
     state = state if isinstance(state, State) else at_rest(state)
     start = task.terminal_cost(episode, at_rest(episode.start))
     return (start - task.terminal_cost(episode, state)) / start
-
-
-TaskFactory = Callable[[int], Task]
-
-_REGISTRY: dict[str, tuple[TaskFactory, int, int, str]] = {}
-
-
-def register(
-    name: str, *, full: int, quick: int, group: str = "others"
-) -> Callable[[TaskFactory], TaskFactory]:
-    """Add a task to the registry under a name.
-
-    Args:
-        name: of the task.
-        full: resolution of the task as it is studied.
-        quick: resolution for tests and smoke runs.
-        group: of tasks that are studied together: "paper" or "goals" here.
-
-    Raises:
-        ValueError: if the name is taken.
-    """
-    if name in _REGISTRY:
-        raise ValueError(f"task {name!r} is registered already; choose another name")
-
-    def add(factory: TaskFactory) -> TaskFactory:
-        _REGISTRY[name] = (factory, full, quick, group)
-        return factory
-
-    return add
-
-
-def task_names(group: str | None = None) -> tuple[str, ...]:
-    """Names of the registered tasks of a group, or of all."""
-    return tuple(name for name, entry in _REGISTRY.items() if group in (None, entry[3]))
-
-
-def make_task(name: str, resolution: int | None = None, *, quick: bool = False) -> Task:
-    """A registered task.
-
-    Args:
-        name: one of `task_names()`.
-        resolution: particles along the rope or along a side of the cloth; a garment has its
-            square of them. By default that of the full or the quick scale.
-        quick: which of the two scales is the default.
-
-    Raises:
-        ValueError: if there is no such task, or the resolution is too low for it.
-    """
-    if name not in _REGISTRY:
-        raise ValueError(f"unknown task {name!r}; choose from {', '.join(_REGISTRY)}")
-    factory, full, small, _ = _REGISTRY[name]
-    if resolution is None:
-        resolution = small if quick else full
-    if resolution < 5:
-        raise ValueError(f"resolution is {resolution}; a task needs at least 5 particles a side")
-    return factory(resolution)

@@ -76,7 +76,6 @@ def test_a_goal_that_does_not_fit_is_refused():
     task = make_task("rope_folding", 9)
     with pytest.raises(ValueError, match=r"goal of particle 0 is .* give finite coordinates"):
         Task(
-            name="broken",
             body=task.body,
             goal=np.full((9, 3), np.nan),
             episode_fn=task.episode_fn,
