@@ -10,9 +10,10 @@ from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.costs import distance, distance_cost
+from jaxsimp.tasks.episode import Episode
 from jaxsimp.tasks.registry import register
 from jaxsimp.tasks.starts import TurnedStart
-from jaxsimp.tasks.task import Episode, Task
+from jaxsimp.tasks.task import Task
 
 STILL_WEIGHT = 1.2
 """Weight of the displacement of the half that should lie still, after SoftGym."""

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from jaxsimp.dynamics import Actions, State
-from jaxsimp.tasks.task import Episode
+from jaxsimp.tasks.episode import Episode
 
 MATCHED_PARTICLES = 11
 """Number of particles that `MatchingCost` compares; SoftGym chooses 10."""

@@ -1,6 +1,6 @@
 """The registry of tasks: factories that take the resolution, by name."""
 
-import dataclasses
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
@@ -50,12 +50,20 @@ def register(
 
         @wraps(factory)
         def named(resolution: int) -> Task:
-            return dataclasses.replace(factory(resolution), name=name, resolution=resolution)
+            return _named(factory(resolution), name, resolution)
 
         _REGISTRY[name] = _Entry(named, full, quick, group)
         return named
 
     return add
+
+
+def _named(task: Task, name: str, resolution: int) -> Task:
+    """The task with a name and a resolution; what was checked is not checked again."""
+    named = copy.copy(task)
+    object.__setattr__(named, "name", name)
+    object.__setattr__(named, "resolution", resolution)
+    return named
 
 
 def task_names(group: str | None = None) -> tuple[str, ...]:

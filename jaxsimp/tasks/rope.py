@@ -8,9 +8,10 @@ from jaxsimp import goals
 from jaxsimp.bodies import Body, rope
 from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.costs import MatchingCost, distance, distance_cost
+from jaxsimp.tasks.episode import Episode
 from jaxsimp.tasks.registry import register
 from jaxsimp.tasks.starts import CrumpledStart, FixedStart
-from jaxsimp.tasks.task import Episode, Task
+from jaxsimp.tasks.task import Task
 
 ROPE_LENGTH = 0.5375
 """Rest length of SoftGym's rope, metres; the straight goal is `SLACK` of it long."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxsimp import goals
 from jaxsimp.bodies import Body
 from jaxsimp.tasks.crumple import crumple
-from jaxsimp.tasks.task import Episode
+from jaxsimp.tasks.episode import Episode
 
 LARGEST_ANGLE = np.pi / 4
 """Largest angle, radians, by which `TurnedStart` turns a body either way, as in SoftGym."""

@@ -1,17 +1,13 @@
 """What a task is, and how states are scored."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
 from jaxsimp.dynamics import (
-    Actions,
     Pickers,
     Simulation,
     State,
@@ -20,21 +16,8 @@ from jaxsimp.dynamics import (
     make_pickers,
     make_simulation,
 )
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
-@dataclass(frozen=True)
-class Episode:
-    """Where one run starts and where it should end: positions, shape (N, 3), metres."""
-
-    start: Float[Array | np.ndarray, "N 3"]
-    goal: Float[Array | np.ndarray, "N 3"]
-
-
-RunningCost = Callable[[Episode, State, Actions], Float[Array, ""]]
-"""Cost of the state at the end of an action, and of that action, shapes (G,) and (G, 3)."""
-TerminalCost = Callable[[Episode, State], Float[Array, ""]]
-"""Cost of the settled state."""
+from jaxsimp.tasks.check import check_costs, check_count, check_limits, check_seconds
+from jaxsimp.tasks.episode import Episode, EpisodeFn, RunningCost, TerminalCost
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +40,15 @@ class Task:
         longest_time_step: bound on the time step of the simulation, seconds.
         name: of a registered task that of its factory, see `register`.
         resolution: that a registered task was made with, see `make_task`; None of another one.
+
+    Raises:
+        ValueError: if the goal is refused (see `goals.check_goal`), a number is out of its range,
+            or a cost cannot be compiled or is no float scalar.
     """
 
     body: Body
     goal: Float[np.ndarray, "N 3"]
-    episode_fn: Callable[[int], Episode]
+    episode_fn: EpisodeFn
     running_cost: RunningCost
     terminal_cost: TerminalCost
     limits: tuple[float, float, float]
@@ -75,6 +62,14 @@ class Task:
 
     def __post_init__(self) -> None:
         goals.check_goal(self.body, self.goal)
+        check_limits(self.limits)
+        for name, least in (("num_actions", 1), ("num_pickers", 1), ("settle_actions", 0)):
+            check_count(name, getattr(self, name), least)
+        for name in ("action_seconds", "longest_time_step"):
+            check_seconds(name, getattr(self, name))
+        check_costs(
+            self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
+        )
 
     def simulation(self, *, self_contact: bool = False) -> Simulation:
         """The body's simulation, at the task's time step.
