@@ -276,9 +276,9 @@ def _run(
         "seed": seed,
         "num_particles": task.body.num_particles,
         "num_key_points": len(model),
-        "cost_per_iteration": [finite(cost) for cost in found.best_costs[rounds]],
-        "elite_cost_per_iteration": [finite(costs.mean()) for costs in elite_costs],
-        "final_cost": finite(found.cost),
+        "cost_per_iteration": [finite(float(cost)) for cost in found.best_costs[rounds]],
+        "elite_cost_per_iteration": [finite(float(costs.mean())) for costs in elite_costs],
+        "final_cost": finite(float(found.cost)),
         "final_score": score,
         "missed_contacts": execution.missed,
         "rollouts": plan.num_rollouts,
@@ -313,7 +313,7 @@ def _row_config(planner: Planner, algorithm: CEM) -> dict[str, Any]:
 
 def finite(value: float) -> float | None:
     """JSON has no infinity: a cost that no rollout gave is null."""
-    return float(value) if np.isfinite(value) else None
+    return value if np.isfinite(value) else None
 
 
 def key_points(study: Study, name: str) -> KeyPoints:

@@ -9,6 +9,7 @@ from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.cem import CEM
 from jaxsimp.planning.descent import Descent
 from jaxsimp.planning.encodings import ENCODINGS, Categorical, Encoding, GaussianIndex, Joint
+from jaxsimp.planning.host import search_on_host
 from jaxsimp.planning.loop import Optimum, optimize
 from jaxsimp.planning.planner import Plan, Planner
 from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_space, make_problem
@@ -45,4 +46,5 @@ __all__ = [
     "make_problem",
     "optimize",
     "price",
+    "search_on_host",
 ]

@@ -46,6 +46,10 @@ class Algorithm(Protocol):
     States are pytrees of arrays of fixed shapes. All functions are pure JAX.
     """
 
+    def __hash__(self) -> int:
+        """Of the settings: what is compiled for an algorithm is kept."""
+        ...
+
     @property
     def num_asks(self) -> int:
         """How often it asks."""

@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Float
 
 from jaxsimp.dynamics import NONE, Actions
 from jaxsimp.engines import (
@@ -24,17 +24,9 @@ from jaxsimp.engines import (
 )
 from jaxsimp.engines.rollouts import as_float
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence, Told, Wants, stages
-from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.cem import CEM
-from jaxsimp.planning.exchanges import compiled_exchanges
-from jaxsimp.planning.loop import (
-    Optimum,
-    Progress,
-    Recorded,
-    archive_size,
-    evaluation,
-    search,
-)
+from jaxsimp.planning.host import compiled_exchanges, search_on_host
+from jaxsimp.planning.loop import Optimum, archive_size, evaluation
 from jaxsimp.planning.problem import Candidates, TaskProblem, action_space, make_problem
 from jaxsimp.planning.space import ActionSpace
 from jaxsimp.tasks import Episode, Task
@@ -124,9 +116,8 @@ class Planner:
         space = action_space(self.task, candidates)
         compile_seconds = self.prepare(algorithm, space)
         bill = _Bill(partial(self._told, as_float(episode)))
-        run_stage = partial(_run_stage, space, archive_size(algorithm), bill, on_ask)
         start = time.perf_counter()
-        optimum = search(algorithm, space, jax.random.key(seed), run_stage, bill.cost_of_one)
+        optimum = search_on_host(algorithm, space, jax.random.key(seed), bill, on_ask)
         optimum = jax.device_get(optimum)
         return Plan(
             actions=jax.tree.map(jnp.asarray, optimum.actions),
@@ -261,31 +252,3 @@ class _Bill:
         self.num_plans += len(actions.pick)
         self.price += PRICES[wants] * len(actions.pick)
         return self._evaluate(wants, actions)
-
-    def cost_of_one(self, actions: Actions) -> Told:
-        """The cost of one plan."""
-        told = self("cost", jax.tree.map(lambda leaf: leaf[None], actions))
-        return Told(told.costs[0])
-
-
-def _run_stage(
-    space: ActionSpace,
-    archive_size: int,
-    bill: _Bill,
-    on_ask: Callable[[], None],
-    algorithm: Algorithm,
-    archive: Archive,
-    failed: Int[Array, ""],
-    keys: PRNGKeyArray,
-) -> tuple[Progress, Actions, Recorded]:
-    """All exchanges of one algorithm, in a loop on the host; see `loop.RunStage`."""
-    exchanges, records = compiled_exchanges(algorithm, space, archive_size), []
-    progress = exchanges.begin(space, archive, failed)
-    for key in keys:
-        progress, plans, actions = exchanges.ask(space, progress, key)
-        told = bill(algorithm.wants, actions)
-        progress, recorded = exchanges.absorb(space, progress, plans, told)
-        records.append(recorded)
-        on_ask()
-    recorded = jax.tree.map(lambda *leaves: np.stack(leaves), *records)
-    return progress, exchanges.finish(space, progress), recorded

@@ -1,4 +1,8 @@
-"""Exchanges of the loop on the host, compiled ahead: nothing is drawn to trigger compilation."""
+"""The driver on the host: exchanges compiled ahead, evaluations by any function.
+
+Costs may come from anywhere: from `Planner`, which evaluates plans on all cores, from an engine
+that is not in JAX, or from a robot.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,12 +11,23 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxsimp.dynamics import Actions
-from jaxsimp.planning.algorithm import Algorithm, Told
+from jaxsimp.engines.rollouts import as_float
+from jaxsimp.planning.algorithm import Algorithm, Sequence, Told, Wants
 from jaxsimp.planning.archive import Archive, empty_archive
-from jaxsimp.planning.loop import Progress, Recorded, absorb, ask, begin, finish
+from jaxsimp.planning.loop import (
+    Optimum,
+    Progress,
+    Recorded,
+    absorb,
+    ask,
+    begin,
+    finish,
+    search,
+)
 from jaxsimp.planning.space import ActionSpace, Plans
 
 QUICK = {"xla_backend_optimization_level": 0}
@@ -30,6 +45,48 @@ class Exchanges:
     ask: Callable[[ActionSpace, Progress, PRNGKeyArray], tuple[Progress, Plans, Actions]]
     absorb: Callable[[ActionSpace, Progress, Plans, Told], tuple[Progress, Recorded]]
     finish: Callable[[ActionSpace, Progress], Actions]
+
+
+Evaluate = Callable[[Wants, Actions], Told]
+"""What is wanted of plans, leading axis `B`."""
+
+
+def search_on_host(
+    algorithm: Algorithm | Sequence,
+    space: ActionSpace,
+    key: PRNGKeyArray,
+    evaluate: Evaluate,
+    on_ask: Callable[[], None] = lambda: None,
+) -> Optimum:
+    """Search for a plan of low cost: `optimize`, in a loop on the host.
+
+    Args:
+        algorithm: that searches, or several that follow one another.
+        space: the plans that may be searched.
+        key: of the random draws.
+        evaluate: what is wanted of plans; costs may be NumPy arrays.
+        on_ask: called after each question of an algorithm.
+    """
+
+    def run_stage(
+        stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: PRNGKeyArray
+    ) -> tuple[Progress, Actions, Recorded]:
+        exchanges, records = compiled_exchanges(stage, space, len(archive.costs)), []
+        progress = exchanges.begin(space, archive, failed)
+        for each in keys:
+            progress, plans, actions = exchanges.ask(space, progress, each)
+            told = as_float(evaluate(stage.wants, actions))
+            progress, recorded = exchanges.absorb(space, progress, plans, told)
+            records.append(recorded)
+            on_ask()
+        recorded = jax.tree.map(lambda *leaves: np.stack(leaves), *records)
+        return progress, exchanges.finish(space, progress), recorded
+
+    def cost_of_one(actions: Actions) -> Told:
+        one = jax.tree.map(lambda leaf: leaf[None], actions)
+        return Told(evaluate("cost", one).costs[0])
+
+    return search(algorithm, space, key, run_stage, cost_of_one)
 
 
 def compiled_exchanges(algorithm: Algorithm, space: ActionSpace, archive_size: int) -> Exchanges:
@@ -70,5 +127,5 @@ def _lower(
 
 def _told(algorithm: Algorithm, actions: Any) -> Told:
     """The shapes of what the algorithm is told of plans."""
-    costs = jax.ShapeDtypeStruct(actions.pick.shape[:1], jnp.result_type(float))
+    costs: Any = jax.ShapeDtypeStruct(actions.pick.shape[:1], jnp.result_type(float))
     return Told(costs, actions.displacement if algorithm.wants == "gradient" else None)
