@@ -10,8 +10,7 @@ import numpy as np
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER, ROWS_FILE, Study, key_points
 from jaxsimp import viz
-from jaxsimp.planning import load_plan
-from jaxsimp.records import write_json
+from jaxsimp.records import load_plan, write_json
 
 Rows = list[dict[str, Any]]
 SUMMARY_FILE = "summary.json"

@@ -20,10 +20,9 @@ from experiments import plans
 from experiments.scripted import SCRIPTS, scripted_plan
 from jaxsimp import records
 from jaxsimp.dynamics import Actions
-from jaxsimp.engines import MassSprings
-from jaxsimp.engines.mujoco.execution import Replay, replay
+from jaxsimp.engines import Execution, MassSprings, replay
 from jaxsimp.engines.mujoco.model import VARIANTS
-from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
+from jaxsimp.records import load_plan, save_plan
 from jaxsimp.tasks import Task, score
 
 ROWS_FILE = "replays.jsonl"
@@ -125,17 +124,17 @@ def _row_of_plan(row: dict[str, Any]) -> dict[str, Any]:
 def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
     """Plans made by hand, carried out in our dynamics where they are not on disk yet."""
     (folder / plans.PLANS_FOLDER).mkdir(exist_ok=True)
-    cases, planners = [], {}
+    cases, executors = [], {}
     for name, seed in study.scripted():
         path = folder / plans.PLANS_FOLDER / f"{name}-{SCRIPTED}-{seed}.npz"
         task = study.plans.task(name)
         episode = task.episode_fn(seed)
         if not path.exists():
-            if name not in planners:
+            if name not in executors:
                 console.print(f"{name}: plans made by hand")
-                planners[name] = executor(task, study.plans.self_contact)
+                executors[name] = MassSprings(study.plans.self_contact).executor(task)
             actions = scripted_plan(task, episode)
-            execution = planners[name].execute(episode, actions)
+            execution = executors[name](episode, actions)
             save_plan(path, actions, execution.positions)
         settled = load_plan(path)[1]["positions"][-1].astype(float)
         value = float(score(task, episode, jnp.asarray(settled)))
@@ -150,12 +149,6 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
         }
         cases.append(Case(row, path))
     return cases
-
-
-def executor(task: Task, self_contact: bool) -> Planner:
-    """Carries out plans in our dynamics, and searches for none."""
-    judge = MassSprings(self_contact=self_contact)
-    return Planner(task, CEMConfig(1, 1, 1), Layout(), judge=judge)
 
 
 def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console) -> None:
@@ -192,7 +185,7 @@ def _replay_task(task: Task, cases: list[Case], folder: Path) -> Iterator[dict[s
         yield case.row | _fields(replays)
 
 
-def _fields(replays: dict[str, Replay]) -> dict[str, Any]:
+def _fields(replays: dict[str, Execution]) -> dict[str, Any]:
     """What replays add to a row."""
     warnings = [f"{name}: {each}" for name, one in replays.items() for each in one.warnings]
     scores = {f"mujoco_{name}_score": plans.finite(one.score) for name, one in replays.items()}
@@ -200,7 +193,7 @@ def _fields(replays: dict[str, Replay]) -> dict[str, Any]:
     return scores | status | {"warnings": warnings}
 
 
-def _save(folder: Path, case: Case, variant: str, actions: Actions, result: Replay) -> None:
+def _save(folder: Path, case: Case, variant: str, actions: Actions, result: Execution) -> None:
     save_plan(replay_path(folder, case.row, variant), actions, result.positions)
 
 

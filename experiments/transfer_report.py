@@ -10,8 +10,7 @@ from experiments.plans import PLANS_FOLDER
 from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, Study, replay_path
 from jaxsimp import viz
 from jaxsimp.engines.mujoco.model import VARIANTS
-from jaxsimp.planning import load_plan
-from jaxsimp.records import write_json
+from jaxsimp.records import load_plan, write_json
 
 Rows = list[dict[str, Any]]
 ENGINES = {

@@ -10,11 +10,10 @@ from jaxtyping import Float, Int
 
 from experiments.physics.measure import Positions, hang, rms, upright
 from experiments.scripted import scripted_plan
-from experiments.transfer import executor
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions
-from jaxsimp.engines.mujoco.execution import replay
+from jaxsimp.engines import MassSprings, replay
 from jaxsimp.engines.mujoco.model import make_model
 from jaxsimp.tasks import Episode, Task, make_task, score
 from jaxsimp.viz import COLORS
@@ -150,7 +149,7 @@ def folds(name: str, resolution: int, seed: int = 0) -> dict[str, Fold]:
 
 def carry_out(task: Task, episode: Episode, plan: Actions, *, self_contact: bool) -> Positions:
     """Where a plan leaves a body in our dynamics once it has settled, metres."""
-    done = executor(task, self_contact).execute(episode, plan)
+    done = MassSprings(self_contact).executor(task)(episode, plan)
     return done.positions[-1].astype(float)
 
 

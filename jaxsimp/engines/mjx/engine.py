@@ -9,7 +9,6 @@ second opinion on contact. Gradients are not promised.
 
 import contextlib
 import io
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -22,7 +21,10 @@ from jaxsimp.bodies import Body
 from jaxsimp.dynamics import Actions, Pickers, Simulation, State, make_simulation
 from jaxsimp.dynamics.contact.table import table_contact
 from jaxsimp.dynamics.pickers import grasp, speed_profile
+from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.mjx.tendons import tendon_spec
+from jaxsimp.engines.rollouts import RolloutExecutor
+from jaxsimp.engines.springs import CHUNK_SIZE
 from jaxsimp.tasks import Task
 
 MOST_PARTICLES = 100
@@ -122,9 +124,9 @@ def mjx_rollout(
     pickers: Pickers,
     state: State,
     actions: Actions,
-    observe: Callable[[State], PyTree[Any]] = lambda state: state.position,
+    observe: Observe = lambda state, action: state.position,
 ) -> tuple[State, PyTree[Any]]:
-    """Carry out a plan in MJX: arguments and result as of `jaxsimp.dynamics.rollout`."""
+    """Carry out a plan in MJX: arguments and result as of `SearchEngine.rollout`."""
 
     def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:
         ours = simulation.ours
@@ -135,7 +137,7 @@ def mjx_rollout(
             return _step(simulation, state, held, drive * share), None
 
         state, _ = jax.lax.scan(one, state, speed_profile(pickers.steps))
-        return state, observe(state)
+        return state, observe(state, action)
 
     return jax.lax.scan(act, state, actions)
 
@@ -197,7 +199,19 @@ class MJX:
         physics: tuple[MJXSimulation, Pickers],
         state: State,
         actions: Actions,
-        observe: Callable[[State], PyTree[Any]],
+        observe: Observe,
     ) -> tuple[State, PyTree[Any]]:
         """See `mjx_rollout`."""
         return mjx_rollout(*physics, state, actions, observe)
+
+    def risk(self, costs: Float[Array, ""]) -> Float[Array, ""]:
+        """The cost itself."""
+        return costs
+
+    def chunk_size(self, physics: tuple[MJXSimulation, Pickers]) -> int:
+        """As of mass-springs: not measured."""
+        return CHUNK_SIZE
+
+    def executor(self, task: Task) -> Executor:
+        """See `Engine.executor`."""
+        return RolloutExecutor(task, self, self.physics(task))
