@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -109,7 +110,9 @@ def score(
 ) -> Float[Array, ""]:
     """Normalised score `(c_0 - c) / c_0`: 1 where the cost is 0, 0 where it is that of the start.
 
-    `c_0` and `c` are terminal costs of the start, at rest, and of the state.
+    `c_0` and `c` are terminal costs of the start, at rest, and of the state. Of a start that costs
+    nothing the score is the limit of small `c_0`: 1 where `c` is 0, too, and minus infinity where
+    it is more. The score is not a number only where a cost is none.
 
     Args:
         task: what is asked.
@@ -118,4 +121,8 @@ def score(
     """
     state = state if isinstance(state, State) else at_rest(state)
     start = task.terminal_cost(episode, at_rest(episode.start))
-    return (start - task.terminal_cost(episode, state)) / start
+    cost = task.terminal_cost(episode, state)
+    relative = start != 0
+    ratio = (start - cost) / jnp.where(relative, start, 1.0)
+    of_free_start = jnp.where(cost > 0, -jnp.inf, 1.0 - cost)  # not a number where the cost is none
+    return jnp.where(relative, ratio, of_free_start)
