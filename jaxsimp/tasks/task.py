@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
@@ -17,8 +17,8 @@ from jaxsimp.dynamics import (
     make_pickers,
     make_simulation,
 )
-from jaxsimp.tasks.check import check_costs, check_count, check_limits, check_seconds
-from jaxsimp.tasks.episode import Episode, EpisodeFn, RunningCost, TerminalCost
+from jaxsimp.tasks.check import check_costs, check_count, check_draw, check_limits, check_seconds
+from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +39,14 @@ class Task:
         settle_actions: as many times `action_seconds` pass, with nothing held, after the
             last action and before the plan is scored.
         longest_time_step: bound on the time step of the simulation, seconds.
+        draw_fn: from a key to start and goal, pure JAX; None where starts are made by seed only.
         name: of a registered task that of its factory, see `register`.
         resolution: that a registered task was made with, see `make_task`; None of another one.
 
     Raises:
         ValueError: if the goal is refused (see `goals.check_goal`), a number is out of its range,
-            or a cost cannot be compiled or is no float scalar.
+            a cost cannot be compiled or is no float scalar, or `draw_fn` draws no episode of
+            the body.
     """
 
     body: Body
@@ -58,6 +60,7 @@ class Task:
     action_seconds: float = 0.3
     settle_actions: int = 4
     longest_time_step: float = 2e-3
+    draw_fn: DrawFn | None = None
     name: str = "unnamed"
     resolution: int | None = None
 
@@ -71,6 +74,23 @@ class Task:
         check_costs(
             self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
         )
+        if self.draw_fn is not None:
+            check_draw(self.draw_fn, self.body.num_particles)
+
+    def draw_episode(self, key: PRNGKeyArray) -> Episode:
+        """A random episode, drawn by a key: pure JAX, to which `jit` and `vmap` over keys apply.
+
+        The starts are as those of `episode_fn`; the start of no key is that of a seed.
+
+        Raises:
+            ValueError: if the starts of this task are made by seed only.
+        """
+        if self.draw_fn is None:
+            raise ValueError(
+                f"the task {self.name!r} has no draw_fn, as its starts may need a simulation; use "
+                f"episode_fn(seed), or give the task a draw_fn"
+            )
+        return self.draw_fn(key)
 
     def simulation(self, *, self_contact: bool = False) -> Simulation:
         """The body's simulation, at the task's time step.
