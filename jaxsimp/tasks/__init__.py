@@ -15,7 +15,7 @@ from jaxsimp.tasks import garments
 
 # isort: split
 from jaxsimp.tasks.costs import distance_cost, matching_cost, matching_distance
-from jaxsimp.tasks.crumple import crumple
+from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.task import (
     CostFn,
     Episode,

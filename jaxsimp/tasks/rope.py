@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from jaxsimp import goals
 from jaxsimp.bodies import Body, rope
 from jaxsimp.tasks.costs import distance, distance_cost, matching_cost
-from jaxsimp.tasks.crumple import crumple
+from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.task import Episode, Task, register
 
 ROPE_LENGTH = 0.5375
