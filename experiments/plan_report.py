@@ -9,9 +9,8 @@ import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER, ROWS_FILE, Study, key_points
-from jaxsimp import viz
+from jaxsimp import records, viz
 from jaxsimp.planning import load_plan
-from jaxsimp.records import write_json
 
 Rows = list[dict[str, Any]]
 SUMMARY_FILE = "summary.json"
@@ -28,7 +27,7 @@ LABELS = {
 
 def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / SUMMARY_FILE, summary)
+    records.write_json(folder / SUMMARY_FILE, summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     tasks = {name: study.task(name) for name in study.tasks}

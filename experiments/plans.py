@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from experiments.progress import progress_bar
 from jaxsimp import records
 from jaxsimp.engines import Ensemble, MassSprings, Spread, make_ensemble
 from jaxsimp.planning import ENCODINGS, CEMConfig, Planner, save_plan
@@ -30,6 +30,8 @@ PLANNING = ("nominal", "robust", "self_contact", "mixed")
 or with self-contact where the body is a cloth, whose folds have layers."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
+IDENTITY = ("task", "action_space", "pick_encoding", "seed")
+"""Fields that tell a run from all others."""
 PLANS_FOLDER = "plans"
 
 
@@ -185,21 +187,19 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
-    rows = records.read_rows(folder / ROWS_FILE)
-    done = {_identity(row) for row in rows}
+    rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
+    runs = [(name, *run) for name in study.tasks for run in study.runs(name)]
+    todo = rows.left(runs)
     left = {
-        name: [run for run in study.runs(name) if (name, *run) not in done] for name in study.tasks
+        name: [(space, encoding, seed) for task, space, encoding, seed in todo if task == name]
+        for name in study.tasks
     }
-    if any(left.values()):
+    if todo:
         _run_all(study, models, left, folder, console)
-    order = [(name, *run) for name in study.tasks for run in study.runs(name)]
-    rows = sorted(
-        records.read_rows(folder / ROWS_FILE), key=lambda row: order.index(_identity(row))
-    )
     return {
         "environment": records.environment(),
         "models": [_model_row(name, model) for name, model in models.items()],
-        "runs": rows,
+        "runs": rows.in_order(runs),
     }
 
 
@@ -229,13 +229,7 @@ def _run_all(
             f"{len(left[name])} runs of about {seconds[name] / len(left[name]):.1f} s"
         )
     console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for what is left")
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    with progress_bar(console) as progress:
         for name, planner in planners.items():
             bar = progress.add_task(name, total=len(left[name]) * planner.config.num_populations)
             compile_seconds = planner.compile_seconds
@@ -313,10 +307,6 @@ def key_points(study: Study, name: str) -> KeyPoints:
     """The key points of a task's goal."""
     task = study.task(name)
     return simplify(task.body, task.goal, method=study.method)
-
-
-def _identity(row: dict[str, Any]) -> tuple[str, str, str, int]:
-    return row["task"], row["action_space"], row["pick_encoding"], row["seed"]
 
 
 def _model_row(task: str, model: KeyPoints) -> dict[str, Any]:

@@ -14,15 +14,14 @@ from typing import Any
 
 import jax.numpy as jnp
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from experiments import plans
+from experiments.progress import progress_bar
 from experiments.scripted import SCRIPTS, scripted_plan
 from jaxsimp import records
 from jaxsimp.dynamics import Actions
 from jaxsimp.engines import MassSprings
-from jaxsimp.engines.mujoco.execution import Replay, replay
-from jaxsimp.engines.mujoco.model import VARIANTS
+from jaxsimp.engines.mujoco import VARIANTS, Replay, replay
 from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
 from jaxsimp.tasks import Task, score
 
@@ -75,7 +74,7 @@ class Case:
     @property
     def key(self) -> tuple[Any, ...]:
         """What tells it from other plans."""
-        return _key(self.row)
+        return tuple(self.row[name] for name in plans.IDENTITY)
 
 
 def planned_study(folder: Path) -> plans.Study:
@@ -107,8 +106,8 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     cases = [Case(_row_of_plan(row), source / row["plan"]) for row in found]
     cases += _scripted_cases(study, folder, console)
     _replay_all(study, cases, folder, console)
-    rows = {_key(row): row for row in records.read_rows(folder / ROWS_FILE)}
-    ordered = [rows[case.key] for case in cases]
+    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
+    ordered = rows.in_order(case.key for case in cases)
     return {
         "environment": records.environment(),
         "transfer": [row for row in ordered if row["action_space"] != SCRIPTED],
@@ -161,21 +160,16 @@ def executor(task: Task, self_contact: bool) -> Planner:
 def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console) -> None:
     """Replay task by task what has no row yet."""
     (folder / REPLAYS_FOLDER).mkdir(exist_ok=True)
-    done = {_key(row) for row in records.read_rows(folder / ROWS_FILE)}
-    left = [case for case in cases if case.key not in done]
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
+    todo = set(rows.left(case.key for case in cases))
+    left = [case for case in cases if case.key in todo]
+    with progress_bar(console) as progress:
         bar = progress.add_task("replays in MuJoCo", total=len(left))
         for name in study.plans.tasks:
             task = study.plans.task(name)
             of_task = [case for case in left if case.row["task"] == name]
             for row in _replay_task(task, of_task, folder) if of_task else ():
-                records.append_row(folder / ROWS_FILE, row)
+                rows.append(row)
                 progress.advance(bar)
 
 
@@ -207,7 +201,3 @@ def _save(folder: Path, case: Case, variant: str, actions: Actions, result: Repl
 def replay_path(folder: Path, row: dict[str, Any], variant: str) -> Path:
     """Where the motion of a replay is."""
     return folder / REPLAYS_FOLDER / f"{Path(row['plan']).stem}-{variant}.npz"
-
-
-def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in ("task", "action_space", "pick_encoding", "seed"))

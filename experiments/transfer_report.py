@@ -8,10 +8,9 @@ import numpy as np
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER
 from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, Study, replay_path
-from jaxsimp import viz
-from jaxsimp.engines.mujoco.model import VARIANTS
+from jaxsimp import records, viz
+from jaxsimp.engines.mujoco import VARIANTS
 from jaxsimp.planning import load_plan
-from jaxsimp.records import write_json
 
 Rows = list[dict[str, Any]]
 ENGINES = {
@@ -25,7 +24,7 @@ LABELS = {"key_points": "key points", "all_particles": "all particles", SCRIPTED
 
 def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / "summary.json", summary)
+    records.write_json(folder / "summary.json", summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     rows = [*summary["transfer"], *summary["scripted"]]

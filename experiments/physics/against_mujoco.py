@@ -14,8 +14,7 @@ from experiments.transfer import executor
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions
-from jaxsimp.engines.mujoco.execution import replay
-from jaxsimp.engines.mujoco.model import make_model
+from jaxsimp.engines.mujoco import make_model, replay
 from jaxsimp.tasks import Episode, Task, make_task, score
 from jaxsimp.viz import COLORS
 
