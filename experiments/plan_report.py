@@ -9,8 +9,7 @@ import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER, ROWS_FILE, Study, key_points
-from jaxsimp import viz
-from jaxsimp.records import load_plan, write_json
+from jaxsimp import records, viz
 
 Rows = list[dict[str, Any]]
 SUMMARY_FILE = "summary.json"
@@ -27,7 +26,7 @@ LABELS = {
 
 def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / SUMMARY_FILE, summary)
+    records.write_json(folder / SUMMARY_FILE, summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     tasks = {name: study.task(name) for name in study.tasks}
@@ -86,7 +85,7 @@ def _typical_plans(rows: Rows, folder: Path) -> dict[str, tuple[np.ndarray, floa
     """Positions and score of the plan of the typical seed, by method."""
     chosen = _methods(_of(rows, seed=_typical_seed(rows)))
     return {
-        method: (load_plan(folder / run["plan"])[1]["positions"], _score(run))
+        method: (records.load_plan(folder / run["plan"]).positions, _score(run))
         for method, (run,) in chosen.items()
     }
 

@@ -16,11 +16,9 @@ from experiments import simplification, transfer
 from experiments.plans import ACTION_SPACES, Study, run_study
 from experiments.simplification import available_methods
 from jaxsimp import records
+from jaxsimp.cli.status import exit_status
 from jaxsimp.planning import ENCODINGS
 from jaxsimp.tasks import make_task, task_names
-
-INTERRUPTED = 130
-"""Exit status of a program that Ctrl-C ended, as shells have it."""
 
 
 @dataclass(frozen=True)
@@ -279,22 +277,18 @@ def results_folder(options: Options) -> Path:
 
 def main() -> int:
     """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
-    console = Console()
-    try:
-        name, arguments = _study(sys.argv[1:])
-        options = tyro.cli(
-            STUDIES[name],
-            prog=f"python -m experiments.run {name}",
-            args=arguments,
-            description=f"{inspect.getdoc(STUDIES[name])}\n\nStudies: {', '.join(STUDIES)}.",
-        )
-        options.run(console)
-    except (ValueError, records.ResultsError) as error:
-        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
-        return 2
-    except KeyboardInterrupt:
-        console.print("\ninterrupted; the same command goes on where it was")
-        return INTERRUPTED
+    return exit_status(_run, "interrupted; the same command goes on where it was")
+
+
+def _run() -> int:
+    name, arguments = _study(sys.argv[1:])
+    options = tyro.cli(
+        STUDIES[name],
+        prog=f"python -m experiments.run {name}",
+        args=arguments,
+        description=f"{inspect.getdoc(STUDIES[name])}\n\nStudies: {', '.join(STUDIES)}.",
+    )
+    options.run(Console())
     return 0
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from experiments.ideal_goals import (
     FOLDS,
@@ -26,12 +25,15 @@ from experiments.ideal_goals import (
     ideal_line,
     is_right,
 )
+from experiments.progress import progress_bar
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
 from jaxsimp import records
 from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.simplification import METHODS, simplify_batch
 
 ROWS_FILE = "goals.jsonl"
+IDENTITY = ("kind", "name", "size", "noise", "level", "gap", "rounding", "seed", "method")
+"""Fields that tell a row from all others: those of a `Case`, and the method."""
 ROPE_LENGTH = 1.0
 ROPE_LEVELS, CLOTH_LEVELS = (0.001, 0.002, 0.004), (0.0005, 0.001, 0.002)
 """Levels of noise, metres: on a rope of 1 m and a cloth of 0.3 m."""
@@ -153,27 +155,17 @@ def available_methods() -> tuple[str, ...]:
 
 def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     """Simplify what is not in the folder yet, and return the summary of everything in it."""
-    path = folder / ROWS_FILE
-    done = {_identity(row) for row in records.read_rows(path)}
-    cases = list(study.cases())
-    left = [
-        (case, method)
-        for case in cases
+    rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
+    todo = {
+        (*asdict(case).values(), method): (case, method)
+        for case in study.cases()
         for method in study.methods
-        if (*asdict(case).values(), method) not in done
-    ]
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    }
+    left = [todo[key] for key in rows.left(todo)]
+    with progress_bar(console) as progress:
         for case, method in progress.track(left, description="goals"):
-            records.append_row(path, _row(case, case.make(), method))
-    order = {(*asdict(case).values(), m): i for i, case in enumerate(cases) for m in study.methods}
-    rows = sorted(records.read_rows(path), key=lambda row: order[_identity(row)])
-    return {"environment": records.environment(), "goals": rows}
+            rows.append(_row(case, case.make(), method))
+    return {"environment": records.environment(), "goals": rows.in_order(todo)}
 
 
 def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
@@ -192,8 +184,3 @@ def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
         "max_error": found.max_error if np.isfinite(found.max_error) else None,
         "tolerance": found.tolerance,
     }
-
-
-def _identity(row: dict[str, Any]) -> tuple[Any, ...]:
-    fields = ("kind", "name", "size", "noise", "level", "gap", "rounding", "seed", "method")
-    return tuple(row[name] for name in fields)

@@ -8,8 +8,7 @@ import numpy as np
 
 from experiments.markdown import provenance, save_figure, success_interval, table
 from experiments.simplification import ROWS_FILE, Case, Study
-from jaxsimp import viz
-from jaxsimp.records import write_json
+from jaxsimp import records, viz
 from jaxsimp.simplification import KeyPoints, simplify_batch
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ SHOWN = ("M, unequal", "triangle 3 4 5", "letter", "quarter", "four corners", "t
 
 def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / "summary.json", summary)
+    records.write_json(folder / "summary.json", summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     rows = summary["goals"]

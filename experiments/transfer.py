@@ -14,15 +14,13 @@ from typing import Any
 
 import jax.numpy as jnp
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from experiments import plans
+from experiments.progress import progress_bar
 from experiments.scripted import SCRIPTS, scripted_plan
 from jaxsimp import records
-from jaxsimp.dynamics import Actions
-from jaxsimp.engines import Execution, MassSprings, replay
-from jaxsimp.engines.mujoco.model import VARIANTS
-from jaxsimp.records import load_plan, save_plan
+from jaxsimp.engines import Execution, MassSprings, MuJoCo, replay
+from jaxsimp.engines.mujoco import VARIANTS
 from jaxsimp.tasks import Task, score
 
 ROWS_FILE = "replays.jsonl"
@@ -74,7 +72,7 @@ class Case:
     @property
     def key(self) -> tuple[Any, ...]:
         """What tells it from other plans."""
-        return _key(self.row)
+        return tuple(self.row[name] for name in plans.IDENTITY)
 
 
 def planned_study(folder: Path) -> plans.Study:
@@ -106,8 +104,8 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     cases = [Case(_row_of_plan(row), source / row["plan"]) for row in found]
     cases += _scripted_cases(study, folder, console)
     _replay_all(study, cases, folder, console)
-    rows = {_key(row): row for row in records.read_rows(folder / ROWS_FILE)}
-    ordered = [rows[case.key] for case in cases]
+    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
+    ordered = rows.in_order(case.key for case in cases)
     return {
         "environment": records.environment(),
         "transfer": [row for row in ordered if row["action_space"] != SCRIPTED],
@@ -135,8 +133,9 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
                 executors[name] = MassSprings(study.plans.self_contact).executor(task)
             actions = scripted_plan(task, episode)
             execution = executors[name](episode, actions)
-            save_plan(path, actions, execution.positions)
-        settled = load_plan(path)[1]["positions"][-1].astype(float)
+            engine = MassSprings(study.plans.self_contact)
+            records.save_plan(path, task, episode, actions, execution, engine=engine)
+        settled = records.load_plan(path).positions[-1].astype(float)
         value = float(score(task, episode, jnp.asarray(settled)))
         row = {
             "planning": SCRIPTED,
@@ -154,34 +153,30 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
 def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console) -> None:
     """Replay task by task what has no row yet."""
     (folder / REPLAYS_FOLDER).mkdir(exist_ok=True)
-    done = {_key(row) for row in records.read_rows(folder / ROWS_FILE)}
-    left = [case for case in cases if case.key not in done]
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
+    todo = set(rows.left(case.key for case in cases))
+    left = [case for case in cases if case.key in todo]
+    with progress_bar(console) as progress:
         bar = progress.add_task("replays in MuJoCo", total=len(left))
         for name in study.plans.tasks:
             task = study.plans.task(name)
             of_task = [case for case in left if case.row["task"] == name]
             for row in _replay_task(task, of_task, folder) if of_task else ():
-                records.append_row(folder / ROWS_FILE, row)
+                rows.append(row)
                 progress.advance(bar)
 
 
 def _replay_task(task: Task, cases: list[Case], folder: Path) -> Iterator[dict[str, Any]]:
     """Replay plans in every variant, save each one's motions, and return its row."""
     episodes = [task.episode_fn(case.row["seed"]) for case in cases]
-    plans = [load_plan(case.path)[0] for case in cases]
+    plans = [records.load_plan(case.path).actions for case in cases]
     # All variants at once: no core waits for the last plan of one.
     found = [replay(task, episodes, plans, name) for name in VARIANTS]
-    for case, actions, *results in zip(cases, plans, *found, strict=True):
+    for case, episode, actions, *results in zip(cases, episodes, plans, *found, strict=True):
         replays = dict(zip(VARIANTS, results, strict=True))
         for name, result in replays.items():
-            _save(folder, case, name, actions, result)
+            path = replay_path(folder, case.row, name)
+            records.save_plan(path, task, episode, actions, result, engine=MuJoCo(name))
         yield case.row | _fields(replays)
 
 
@@ -193,14 +188,6 @@ def _fields(replays: dict[str, Execution]) -> dict[str, Any]:
     return scores | status | {"warnings": warnings}
 
 
-def _save(folder: Path, case: Case, variant: str, actions: Actions, result: Execution) -> None:
-    save_plan(replay_path(folder, case.row, variant), actions, result.positions)
-
-
 def replay_path(folder: Path, row: dict[str, Any], variant: str) -> Path:
     """Where the motion of a replay is."""
     return folder / REPLAYS_FOLDER / f"{Path(row['plan']).stem}-{variant}.npz"
-
-
-def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in ("task", "action_space", "pick_encoding", "seed"))

@@ -8,9 +8,8 @@ import numpy as np
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER
 from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, Study, replay_path
-from jaxsimp import viz
-from jaxsimp.engines.mujoco.model import VARIANTS
-from jaxsimp.records import load_plan, write_json
+from jaxsimp import records, viz
+from jaxsimp.engines.mujoco import VARIANTS
 
 Rows = list[dict[str, Any]]
 ENGINES = {
@@ -24,7 +23,7 @@ LABELS = {"key_points": "key points", "all_particles": "all particles", SCRIPTED
 
 def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / "summary.json", summary)
+    records.write_json(folder / "summary.json", summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     rows = [*summary["transfer"], *summary["scripted"]]
@@ -74,7 +73,7 @@ def _picture(study: Study, folder: Path, row: dict[str, Any], name: str) -> str:
     )
     paths = [source / row["plan"], *(replay_path(folder, row, variant) for variant in VARIANTS)]
     motions = {
-        engine: (load_plan(path)[1]["positions"], _score(row, column))
+        engine: (records.load_plan(path).positions, _score(row, column))
         for (engine, column), path in zip(ENGINES.items(), paths, strict=True)
     }
     goal = np.asarray(task.episode_fn(row["seed"]).goal)

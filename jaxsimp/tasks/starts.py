@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
-from jaxsimp.tasks.crumple import crumple
+from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.episode import Episode
 
 LARGEST_ANGLE = np.pi / 4
