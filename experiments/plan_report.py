@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
-from experiments.plans import PLANS_FOLDER, ROWS_FILE, Study, key_points
+from experiments.plans import PLANS_FOLDER, ROWS_FILE, PlanStudy, key_points
 from jaxsimp import records, viz
 
 Rows = list[dict[str, Any]]
@@ -24,7 +24,7 @@ LABELS = {
 }
 
 
-def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
+def write_report(study: PlanStudy, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
     records.write_json(folder / SUMMARY_FILE, summary)
     figures = folder / "figures"
@@ -90,7 +90,7 @@ def _typical_plans(rows: Rows, folder: Path) -> dict[str, tuple[np.ndarray, floa
     }
 
 
-def _report(study: Study, summary: dict[str, Any], transfer: Rows) -> str:
+def _report(study: PlanStudy, summary: dict[str, Any], transfer: Rows) -> str:
     lines = [
         f"# Goal-conditioned model simplification: the study {study.name!r}",
         "",
@@ -143,7 +143,7 @@ def _error(model: dict[str, Any]) -> float:
     return model["errors"][model["sizes"].index(len(model["key_points"]))]
 
 
-def _touching(study: Study) -> str:
+def _touching(study: PlanStudy) -> str:
     return "touches itself" if study.self_contact else "passes through itself"
 
 

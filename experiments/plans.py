@@ -83,7 +83,7 @@ BUDGETS = {
 
 
 @dataclass(frozen=True)
-class Study:
+class PlanStudy:
     """One configuration of the study: what makes two results comparable.
 
     Attributes:
@@ -183,7 +183,7 @@ def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) ->
             raise ValueError(f"{kind} {name!r} is given twice; give it once")
 
 
-def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+def run_study(study: PlanStudy, folder: Path, console: Console) -> dict[str, Any]:
     """Run what is not in the folder yet, and return the summary of everything in it."""
     models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
@@ -205,7 +205,7 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
 
 
 def _run_all(
-    study: Study,
+    study: PlanStudy,
     models: dict[str, KeyPoints],
     left: dict[str, list[tuple[str, str, int]]],
     folder: Path,
@@ -319,7 +319,7 @@ def finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def key_points(study: Study, name: str) -> KeyPoints:
+def key_points(study: PlanStudy, name: str) -> KeyPoints:
     """The key points of a task's goal."""
     task = study.task(name)
     return simplify(task.body, task.goal, method=study.method)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from rich.console import Console
@@ -27,6 +27,7 @@ from experiments.ideal_goals import (
 )
 from experiments.progress import progress_bar
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
+from experiments.study import default_folder
 from jaxsimp import records
 from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.simplification import METHODS, simplify_batch
@@ -44,7 +45,7 @@ ROUNDINGS = (0.0, 0.004)
 
 
 @dataclass(frozen=True)
-class Study:
+class SimplificationStudy:
     """One configuration of the study.
 
     Attributes:
@@ -153,7 +154,7 @@ def available_methods() -> tuple[str, ...]:
     return tuple(name for name in METHODS if name not in missing)
 
 
-def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+def run_study(study: SimplificationStudy, folder: Path, console: Console) -> dict[str, Any]:
     """Simplify what is not in the folder yet, and return the summary of everything in it."""
     rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
     todo = {
@@ -184,3 +185,45 @@ def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
         "max_error": found.max_error if np.isfinite(found.max_error) else None,
         "tolerance": found.tolerance,
     }
+
+
+@dataclass(frozen=True)
+class SimplificationOptions:
+    """How often each method finds the right key points of noisy goals.
+
+    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    """
+
+    NAME: ClassVar[str] = "simplification"
+
+    methods: tuple[str, ...] = available_methods()
+    """Methods to compare (default: all, meshlab where its extra is installed)."""
+    seeds: int = 12
+    """Draws of noise for each goal and resolution."""
+    out: Path | None = None
+    """Output folder (default: results/simplification, or results/simplification-smoke)."""
+    smoke: bool = False
+    """One resolution, one seed."""
+
+    def configuration(self) -> SimplificationStudy:
+        """The study that these options ask for.
+
+        Raises:
+            ValueError: if an option has a value that it cannot have.
+        """
+        return SimplificationStudy(
+            methods=self.methods,
+            seeds=min(self.seeds, 1) if self.smoke else self.seeds,
+            rope_sizes=(41,) if self.smoke else (41, 81),
+            cloth_sizes=(25,) if self.smoke else (25, 45, 64),
+            settled_size=13 if self.smoke else 25,
+        )
+
+    def run(self, console: Console) -> None:
+        """Run the study."""
+        study, folder = self.configuration(), self.out or default_folder(self.NAME, self.smoke)
+        records.open_folder(folder, study.identity())
+        from experiments.simplification_report import write_report
+
+        write_report(study, run_study(study, folder, console), folder)
+        console.print(f"done: {folder}/report.md")

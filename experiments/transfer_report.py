@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER
-from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, Study, replay_path
+from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, TransferStudy, replay_path
 from jaxsimp import records, viz
 from jaxsimp.engines.mujoco import VARIANTS
 
@@ -21,7 +21,7 @@ ENGINES = {
 LABELS = {"key_points": "key points", "all_particles": "all particles", SCRIPTED: "made by hand"}
 
 
-def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
+def write_report(study: TransferStudy, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
     records.write_json(folder / "summary.json", summary)
     figures = folder / "figures"
@@ -65,7 +65,7 @@ def _shown(rows: Rows) -> dict[str, dict[str, Any]]:
     return shown | ({"by_hand": scripted[0]} if scripted else {})
 
 
-def _picture(study: Study, folder: Path, row: dict[str, Any], name: str) -> str:
+def _picture(study: TransferStudy, folder: Path, row: dict[str, Any], name: str) -> str:
     """Draw a plan in all engines, a row each; the file's name."""
     task = study.plans.task(row["task"])
     source = (
@@ -87,7 +87,7 @@ def _score(row: dict[str, Any], column: str) -> float:
     return -np.inf if row[column] is None else row[column]
 
 
-def _report(study: Study, summary: dict[str, Any], pictures: list[str]) -> str:
+def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) -> str:
     lines = [
         "# Transfer: plans found in our dynamics, carried out in MuJoCo",
         "",
