@@ -199,8 +199,11 @@ def test_ends_are_fixed(letters, result):
     assert np.abs(np.array(result(letters[1])[1]["positions"])[0] - goal[0]).max() > 1e-5
 
 
-def test_a_goal_that_no_workspace_holds_is_infeasible(letters, result, capsys):
-    status, found = result(letters[0], "--fixed-ends", "--upper", "1", "0.01", "1")
+def test_a_goal_that_no_workspace_holds_is_infeasible(letters, result, tmp_path, capsys):
+    picture = tmp_path / "goal.png"
+    options = ("--fixed-ends", "--upper", "1", "0.01", "1", "--figure", picture)
+    status, found = result(letters[0], *options)
+    assert picture.stat().st_size > 10_000
     assert status == 1
     assert found.keys() == SCHEMA.keys()
     assert found["status"] == "INFEASIBLE"
