@@ -47,7 +47,10 @@ def test_a_verb_has_help_of_its_own(verb, capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main([verb, "--help"])
     assert ended.value.code == 0
-    assert f"usage: jaxsimp {verb}" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"usage: jaxsimp {verb}" in told
+    described = " ".join(import_module(f"jaxsimp.cli.{verb}").Options.__doc__.split())
+    assert described in " ".join(told.split())
 
 
 def test_the_version_is_the_packages(capsys):

@@ -174,17 +174,21 @@ def test_sizes_without_a_model_are_null():
 def test_a_workspace_is_that_of_the_library(tmp_path, result):
     goal = LETTERS["V"] + [0.0, 0.1, -0.002]
     path = save(tmp_path / "low.npz", positions=goal, rest=ROPE.rest)
-    limits = ("--lower", "-inf", "0.1", "-1", "--upper", "0.14", "inf", "inf")
+    limits = ("--lower", "-inf", "0.11", "-1", "--upper", "0.14", "inf", "inf")
     status, found = result(
         path, "--tolerance", 0.02, "--above-table", "--max-stretch", 0.05, *limits
     )
     workspace = Workspace(
-        lower=(-np.inf, 0.1, -1.0), upper=(0.14, np.inf, np.inf), above_table=True, max_stretch=0.05
+        lower=(-np.inf, 0.11, -1.0),
+        upper=(0.14, np.inf, np.inf),
+        above_table=True,
+        max_stretch=0.05,
     )
     (model,) = simplify_batch(ROPE, goal[None], tolerance=0.02, workspace=workspace)
     assert (status, found["status"]) == (0, "FITS")
     assert found["positions"] == model.positions.tolist()
     assert min(z for _, _, z in found["positions"]) == pytest.approx(ROPE.radius, abs=1e-7)
+    assert min(y for _, y, _ in found["positions"]) == pytest.approx(0.11, abs=1e-7)
     assert max(x for x, _, _ in found["positions"]) <= 0.14 + 1e-7
 
 
@@ -195,8 +199,11 @@ def test_ends_are_fixed(letters, result):
     assert np.abs(np.array(result(letters[1])[1]["positions"])[0] - goal[0]).max() > 1e-5
 
 
-def test_a_goal_that_no_workspace_holds_is_infeasible(letters, result, capsys):
-    status, found = result(letters[0], "--fixed-ends", "--upper", "1", "0.01", "1")
+def test_a_goal_that_no_workspace_holds_is_infeasible(letters, result, tmp_path, capsys):
+    picture = tmp_path / "goal.png"
+    options = ("--fixed-ends", "--upper", "1", "0.01", "1", "--figure", picture)
+    status, found = result(letters[0], *options)
+    assert picture.stat().st_size > 10_000
     assert status == 1
     assert found.keys() == SCHEMA.keys()
     assert found["status"] == "INFEASIBLE"
