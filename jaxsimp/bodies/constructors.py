@@ -36,7 +36,7 @@ def rope(
         changes: parameters in which the rope differs from the material, as `drag=2.0`.
 
     Raises:
-        ValueError: if a number is out of its range.
+        ValueError: if a number is out of its range, or both a mass and a density are given.
         TypeError: if `Material` has no parameter of a name in `changes`.
     """
     require_count("num_particles", num_particles, 2)
@@ -100,7 +100,7 @@ def cloth(
         changes: parameters in which the cloth differs from the material, as `drag=2.0`.
 
     Raises:
-        ValueError: if a number is out of its range.
+        ValueError: if a number is out of its range, or both a mass and a density are given.
         TypeError: if `Material` has no parameter of a name in `changes`.
     """
     for count, extent in zip(shape, size, strict=True):
@@ -182,7 +182,15 @@ def _weigh(
     mass: float | None,
     extent: float,
 ) -> tuple[Material, float]:
-    """The material and the mass, kilograms, of a body of that length, metres, or area."""
+    """The material and the mass, kilograms, of a body.
+
+    The extent is its length, metres, or its area, square metres.
+    """
+    if mass is not None and "density" in changes:
+        raise ValueError(
+            f"mass is {mass:g} and density is {changes['density']:g}; give one of them, the other "
+            f"follows from the size"
+        )
     made = (material or MATERIALS[kind]).changed(**changes)
     if mass is None and (material is not None or "density" in changes):
         return made, made.density * extent

@@ -12,6 +12,9 @@ from jaxsimp.bodies import Body
 from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_contact
 from jaxsimp.dynamics.springs import Springs, make_springs
 
+PHYSICS = ("mass", "radius", "drag", "friction", "gravity", "time_step")
+"""Fields of `Simulation` that velocities depend on, besides springs: those with a cotangent."""
+
 
 @partial(
     jax.tree_util.register_dataclass,
@@ -37,17 +40,7 @@ class State:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=[
-        "springs",
-        "rest",
-        "mass",
-        "radius",
-        "drag",
-        "friction",
-        "gravity",
-        "time_step",
-        "self_contact",
-    ],
+    data_fields=["springs", "rest", *PHYSICS, "self_contact"],
     meta_fields=[],
 )
 @dataclass(frozen=True)

@@ -164,6 +164,12 @@ def test_a_mass_makes_the_density(make, extent):
     assert given.material.density == pytest.approx(0.3 / extent, rel=ROUNDING)
 
 
+@pytest.mark.parametrize("make", [rope, cloth])
+def test_a_mass_and_a_density_at_once_are_refused(make):
+    with pytest.raises(ValueError, match=r"mass is 0.3 and density is 0.1; give one of them"):
+        make(mass=0.3, density=0.1)
+
+
 @pytest.mark.parametrize("kind", ["rope", "cloth"])
 def test_the_default_material_is_that_of_the_default_body(kind):
     found = {"rope": rope, "cloth": cloth}[kind]().material
