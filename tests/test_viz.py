@@ -13,6 +13,7 @@ from scipy import stats
 from jaxsimp import goals, viz
 from jaxsimp.bodies import cloth, from_mesh, rope
 from jaxsimp.bodies.garments import skirt
+from jaxsimp.bodies.meshes import boundary_edges
 from jaxsimp.simplification import FitStatus, KeyPoints
 
 
