@@ -14,10 +14,13 @@ from jaxsimp.dynamics import Actions, State
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
 @dataclass(frozen=True)
 class Episode:
-    """Where one run starts and where it should end: positions, shape (N, 3), metres."""
+    """Where one run starts and where it should end: positions, shape (N, 3), metres.
 
-    start: Float[Array | np.ndarray, "N 3"]
-    goal: Float[Array | np.ndarray, "N 3"]
+    `jax.vmap` may add axes before those.
+    """
+
+    start: Float[Array | np.ndarray, "*E N 3"]
+    goal: Float[Array | np.ndarray, "*E N 3"]
 
 
 EpisodeFn = Callable[[int], Episode]
