@@ -45,7 +45,8 @@ def planned(
 def assert_same(first: Plan, second: Plan) -> None:
     np.testing.assert_array_equal(first.actions.pick, second.actions.pick)
     np.testing.assert_array_equal(first.actions.displacement, second.actions.displacement)
-    jax.tree.map(np.testing.assert_array_equal, first.optimum, second.optimum)
+    for pair in zip(jax.tree.leaves(first.optimum), jax.tree.leaves(second.optimum), strict=True):
+        np.testing.assert_array_equal(*pair)
     assert (first.num_rollouts, first.price) == (second.num_rollouts, second.price)
 
 
