@@ -9,9 +9,18 @@ import pytest
 
 from jaxsimp import goals
 from jaxsimp.dynamics import NONE, Actions, State
-from jaxsimp.engines import Engine, Layout, MassSprings, MuJoCo, SearchEngine
+from jaxsimp.engines import (
+    Engine,
+    Execution,
+    ExecutionStatus,
+    Layout,
+    MassSprings,
+    MuJoCo,
+    SearchEngine,
+    replay,
+)
 from jaxsimp.engines.rollouts import RolloutExecutor
-from jaxsimp.planning import CEM, Planner
+from jaxsimp.planning import CEM, Planner, Reranking, Sequence, action_space, price
 from jaxsimp.tasks import make_task
 
 ALGORITHM = CEM(num_iterations=8, population=32, initial_populations=2)
@@ -128,3 +137,77 @@ def test_what_counts_as_an_engine():
     assert not isinstance(object(), Engine)
     assert isinstance(MuJoCo(), Engine)
     assert not isinstance(MuJoCo(), SearchEngine)
+
+
+# --- what users write, and what fails ------------------------------------------------------------
+
+
+class Still:
+    """The least engine: nothing moves, and all scores are a half."""
+
+    def executor(self, task):
+        def execute(episode, actions):
+            frames = [np.asarray(episode.start)] * (len(actions.pick) + 2)
+            return Execution(np.stack(frames), 0.5)
+
+        return execute
+
+
+def test_an_engine_with_an_executor_alone_evaluates_and_does_not_search():
+    episode, planner = glided(1.0)
+    planner = Planner(planner.task, planner.engine, Still(), planner.layout)
+    plan = planner.plan(episode, np.array([0, 4]), ALGORITHM, 0)
+    done = planner.execute(episode, plan.actions)
+    assert done.score == 0.5
+    assert done.status == ExecutionStatus.FINE
+    np.testing.assert_array_equal(done.positions, np.stack([episode.start] * 4))
+    settled = Sequence((ALGORITHM, Reranking(2)))
+    with pytest.raises(ValueError, match=r"settled scores and the evaluator is .*Still.* give an"):
+        planner.plan(episode, np.array([0, 4]), settled, 0)
+
+
+def test_plans_are_ranked_by_what_the_evaluator_makes_of_them():
+    # The engine glides half as far as the evaluator: what costs least goes too far there.
+    episode, planner = glided(0.5)
+    planner = Planner(planner.task, Gliding(0.5), Gliding(1.0), Layout(4, 1))
+    algorithm = Sequence((ALGORITHM, Reranking(8)))
+    plan = planner.plan(episode, np.array([0, 4]), algorithm, 0)
+    plain = planner.plan(episode, np.array([0, 4]), ALGORITHM, 0)
+    scores = [planner.execute(episode, each.actions).score for each in (plan, plain)]
+    assert scores[0] >= scores[1]
+    # Oracle: each of the eight archived plans, carried out by itself.
+    space, archive = action_space(planner.task, np.array([0, 4])), plan.optimum.archive
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], archive.plans) for i in range(8)]
+    ranked = [planner.execute(episode, space.actions(one)).score for one in each]
+    assert archive.filled.all()
+    assert scores[0] == pytest.approx(max(ranked), abs=1e-6)  # float32, other machine code
+    assert plan.num_rollouts == plain.num_rollouts + 8 + 1  # and the cost of what is returned
+    assert plan.price == price(algorithm) + 1
+
+
+@pytest.mark.parametrize("move", [np.nan, np.inf])
+@pytest.mark.parametrize("self_contact", [False, True])
+def test_a_simulation_that_is_not_finite_is_a_status(move, self_contact):
+    task = make_task("rope_folding", 7)
+    task = dataclasses.replace(task, num_actions=1, settle_actions=1)
+    moves = jnp.full((1, 2, 3), move)
+    execute = MassSprings(self_contact).executor(task)
+    done = execute(task.episode_fn(0), Actions(jnp.array([[0, NONE]]), moves))
+    fine = np.isfinite(done.positions).all() and np.isfinite(done.score)
+    assert done.status == (ExecutionStatus.FINE if fine else ExecutionStatus.UNSTABLE)
+    # An infinite move is clipped to the limits; what is no number cannot be.
+    assert fine == np.isinf(move)
+    assert np.isfinite(done.positions[0]).all()
+
+
+def test_a_planner_executes_in_mujoco():
+    task = make_task("rope_folding", 7)
+    task = dataclasses.replace(task, num_actions=1, settle_actions=1)
+    planner = Planner(task, evaluator=MuJoCo())
+    actions = Actions(jnp.array([[0, NONE]]), jnp.full((1, 2, 3), 0.05))
+    done = planner.execute(task.episode_fn(0), actions)
+    (wanted,) = replay(task, [task.episode_fn(0)], [actions])
+    np.testing.assert_array_equal(done.positions, wanted.positions)
+    assert (done.score, done.status) == (wanted.score, ExecutionStatus.FINE)
+    with pytest.raises(ValueError, match=r"evaluator is MuJoCo.*, no engine in JAX; give another"):
+        planner.plan(task.episode_fn(0), np.array([0]), Reranking(2))

@@ -179,6 +179,33 @@ def test_an_ensemble_of_another_body_is_refused():
         Planner(longer, ensemble())
 
 
+@pytest.mark.parametrize(("statistic", "caution"), [("worst", 0.0), ("mean", 1.5)])
+def test_costs_are_the_risk_of_those_in_each_member_alone(statistic, caution):
+    each = np.stack([costs_alone(small_task(), ensemble(), e) for e in range(3)], axis=1)
+    made = dataclasses.replace(ensemble(), statistic=statistic, caution=caution)
+    found = planner_in(made).costs(small_task().episode_fn(0), plans())
+    wanted = each.max(axis=1) if statistic == "worst" else each.mean(1) + 1.5 * each.std(1)
+    np.testing.assert_allclose(found, wanted, rtol=1e-4)  # as above
+
+
+def test_a_plan_is_executed_in_the_first_member():
+    task, episode = small_task(), small_task().episode_fn(0)
+    one = jax.tree.map(lambda leaf: leaf[0], plans())
+    done = ensemble().executor(task)(episode, one)
+    factors = dict.fromkeys(QUANTITIES[:-1], 1.0)
+    simulation = make_simulation(
+        scaled_body(task.body, **factors), float(ensemble().simulations.time_step[0])
+    )
+    pickers = make_pickers(task.limits, steps=ensemble().action_steps)
+    _, frames = jit_rollout(simulation, pickers, at_rest(episode.start), one)
+    # metres; float32, other machine code
+    np.testing.assert_allclose(done.positions[1:3], frames, atol=1e-5)
+    # Not as in the second member, by far more than rounding.
+    second = jax.tree.map(lambda leaf: leaf[1], ensemble().simulations)
+    _, others = jit_rollout(second, pickers, at_rest(episode.start), one)
+    assert np.abs(done.positions[1:3] - others).max() > 1e-3
+
+
 # --- members -------------------------------------------------------------------------------------
 
 
