@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from experiments import plan_report, plans, run
-from jaxsimp.planning import ENCODINGS, CEMConfig, load_plan
+from jaxsimp.planning import CEM, ENCODINGS
+from jaxsimp.records import load_plan
 from jaxsimp.tasks import make_task, score
 
 ROOT = Path(__file__).parents[2]
@@ -326,7 +327,7 @@ def test_options_replace_the_settings_of_the_budget():
     ).configuration()
     task = study.task("rope_folding")
     config = study.search_config(task)
-    assert config == CEMConfig(
+    assert config == CEM(
         num_iterations=20,
         population=11,
         initial_populations=1,

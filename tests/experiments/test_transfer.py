@@ -14,9 +14,9 @@ import pytest
 from experiments import run
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
-from jaxsimp.engines import MassSprings, make_ensemble
-from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan
-from jaxsimp.records import read_rows
+from jaxsimp.engines import Layout, MassSprings, make_ensemble
+from jaxsimp.planning import Planner
+from jaxsimp.records import load_plan, read_rows
 from jaxsimp.tasks import make_task, score, task_names
 
 TASKS = ("rope_straightening", "cloth_diagonal_folding")
@@ -160,10 +160,8 @@ def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
     task = dataclasses.replace(task, num_actions=1)
     plan = jax.tree.map(lambda array: array[None], load_plan(out / row["plan"])[0])
     robust, nominal = (
-        Planner(task, CEMConfig(1, 1, 1), Layout(), ensemble=ensemble).costs(
-            task.episode_fn(0), plan
-        )[0]
-        for ensemble in (make_ensemble(task, 4), None)
+        Planner(task, engine, layout=Layout()).costs(task.episode_fn(0), plan)[0]
+        for engine in (make_ensemble(task, 4), MassSprings())
     )
     (found,) = read_rows(out / "runs.jsonl")
     assert found["final_cost"] == pytest.approx(robust, rel=1e-5)  # float32
@@ -199,7 +197,7 @@ def test_plans_with_self_contact_are_those_of_its_physics(tmp_path):
     assert row["planning"] == "self_contact"
     task = dataclasses.replace(make_task("rope_folding", 7), num_actions=1)
     plan = load_plan(out / row["plan"])[0]
-    planner = Planner(task, CEMConfig(1, 1, 1), Layout(), engine=MassSprings(self_contact=True))
+    planner = Planner(task, MassSprings(self_contact=True), layout=Layout())
     execution = planner.execute(task.episode_fn(0), plan)
     assert execution.missed is not None
     assert found["final_score"] == pytest.approx(execution.score, abs=1e-5)  # float32
