@@ -16,12 +16,11 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from experiments.progress import progress_bar
 from jaxsimp import records
 from jaxsimp.engines import MassSprings, SearchEngine, Spread, make_ensemble
 from jaxsimp.planning import CEM, ENCODINGS, Planner
-from jaxsimp.records import save_plan
 from jaxsimp.simplification import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
 
@@ -31,6 +30,8 @@ PLANNING = ("nominal", "robust", "self_contact", "mixed")
 or with self-contact where the body is a cloth, whose folds have layers."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
+IDENTITY = ("task", "action_space", "pick_encoding", "seed")
+"""Fields that tell a run from all others."""
 PLANS_FOLDER = "plans"
 
 
@@ -82,7 +83,7 @@ BUDGETS = {
 
 
 @dataclass(frozen=True)
-class Study:
+class PlanStudy:
     """One configuration of the study: what makes two results comparable.
 
     Attributes:
@@ -182,31 +183,29 @@ def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) ->
             raise ValueError(f"{kind} {name!r} is given twice; give it once")
 
 
-def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+def run_study(study: PlanStudy, folder: Path, console: Console) -> dict[str, Any]:
     """Run what is not in the folder yet, and return the summary of everything in it."""
     models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
-    rows = records.read_rows(folder / ROWS_FILE)
-    done = {_identity(row) for row in rows}
+    rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
+    runs = [(name, *run) for name in study.tasks for run in study.runs(name)]
+    todo = rows.left(runs)
     left = {
-        name: [run for run in study.runs(name) if (name, *run) not in done] for name in study.tasks
+        name: [(space, encoding, seed) for task, space, encoding, seed in todo if task == name]
+        for name in study.tasks
     }
-    if any(left.values()):
+    if todo:
         _run_all(study, models, left, folder, console)
-    order = [(name, *run) for name in study.tasks for run in study.runs(name)]
-    rows = sorted(
-        records.read_rows(folder / ROWS_FILE), key=lambda row: order.index(_identity(row))
-    )
     return {
         "environment": records.environment(),
         "models": [_model_row(name, model) for name, model in models.items()],
-        "runs": rows,
+        "runs": rows.in_order(runs),
     }
 
 
 def _run_all(
-    study: Study,
+    study: PlanStudy,
     models: dict[str, KeyPoints],
     left: dict[str, list[tuple[str, str, int]]],
     folder: Path,
@@ -227,19 +226,13 @@ def _run_all(
             f"{len(left[name])} runs of about {seconds[name] / len(left[name]):.1f} s"
         )
     console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for what is left")
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    with progress_bar(console) as progress:
         for name, planner in planners.items():
             algorithm, compile_seconds = study.search_config(planner.task), compiled[name]
             bar = progress.add_task(name, total=len(left[name]) * algorithm.num_asks)
             for run in left[name]:
                 advance = partial(progress.advance, bar)
-                row = _run(planner, algorithm, models[name], run, folder, advance)
+                row = _run(planner, algorithm, models[name], run, folder, environment, advance)
                 row["planning"] = study.planning_of(planner.task)
                 row["success"] = (row["final_score"] or 0.0) >= study.success_score
                 row["environment"] = environment
@@ -254,6 +247,7 @@ def _run(
     model: KeyPoints,
     run: tuple[str, str, int],
     folder: Path,
+    environment: dict[str, Any],
     on_ask: Callable[[], None],
 ) -> dict[str, Any]:
     """Plan once, execute, save the plan, and return the row."""
@@ -265,7 +259,16 @@ def _run(
     plan = planner.plan(episode, candidates, algorithm, seed, on_ask)
     execution = planner.execute(episode, plan.actions)
     file = f"{PLANS_FOLDER}/{task.name}-{action_space}-{encoding}-{seed}.npz"
-    save_plan(folder / file, plan.actions, execution.positions)
+    records.save_plan(
+        folder / file,
+        task,
+        episode,
+        plan.actions,
+        execution,
+        engine=planner.evaluator,
+        found={"algorithm": repr(algorithm), "seed": seed},
+        provenance=environment,
+    )
     score = execution.score if np.isfinite(execution.score) else None
     found, rounds = plan.optimum, slice(algorithm.initial_populations - 1, None)
     elite_costs = found.traces[0]["elite_costs"][rounds]
@@ -316,14 +319,10 @@ def finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def key_points(study: Study, name: str) -> KeyPoints:
+def key_points(study: PlanStudy, name: str) -> KeyPoints:
     """The key points of a task's goal."""
     task = study.task(name)
     return simplify(task.body, task.goal, method=study.method)
-
-
-def _identity(row: dict[str, Any]) -> tuple[str, str, str, int]:
-    return row["task"], row["action_space"], row["pick_encoding"], row["seed"]
 
 
 def _model_row(task: str, model: KeyPoints) -> dict[str, Any]:

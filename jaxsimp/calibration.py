@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.material import PARAMETERS
 from jaxsimp.dynamics.pickers import Actions, Pickers, make_pickers
-from jaxsimp.dynamics.rollout import rollout
+from jaxsimp.dynamics.rollouts import rollout
 from jaxsimp.dynamics.simulation import Simulation, State, largest_time_step, make_simulation
 from jaxsimp.dynamics.springs import make_springs
 

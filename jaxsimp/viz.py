@@ -224,6 +224,10 @@ def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -
 
 def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
     """A model's error by number of key points, with the tolerance and the number chosen."""
+    if not model.sizes:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "infeasible: no model is within the workspace", ha="center")
+        return
     chosen = "chosen" if model.status == FitStatus.FITS else "none fits, last tried"
     axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
     axes.axhline(model.tolerance * 1e3, color=GOAL_COLOR, ls="--", label="tolerance")

@@ -1,20 +1,38 @@
 """What every test shares: strict numerics, no display, and the house's Hypothesis profile."""
 
+import atexit
 import os
-from collections.abc import Iterator
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 
 import jax
 import jaxtyping
 import matplotlib
 import pytest
 from hypothesis import HealthCheck, settings
+from matplotlib.figure import Figure
 
 matplotlib.use("Agg")
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Most of the time goes into compilation, and much of it into programs that were compiled before:
+# by another planner, an earlier test or the process that started this one. They are kept for as
+# long as this process lives, in a folder of its own, since JAX does not write them in one piece.
 # A test that passes must not owe it to what an earlier run left on disk.
-jax.config.update("jax_enable_compilation_cache", False)
+programs = tempfile.mkdtemp(prefix="jaxsimp-tests-")
+atexit.register(shutil.rmtree, programs, ignore_errors=True)
+KEPT = {
+    "jax_compilation_cache_dir": programs,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": 0,
+}
+for name, value in KEPT.items():
+    jax.config.update(name, value)
+    os.environ[name.upper()] = str(value)  # for processes that tests start
 
 settings.register_profile(
     "house",
@@ -52,3 +70,25 @@ def unchecked_shapes() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", before)
+
+
+@pytest.fixture(scope="session")
+def figures_saved() -> Callable[[], AbstractContextManager[dict[str, Figure]]]:
+    """A context that collects the figures written in it, by the names of their files.
+
+    What a figure shows is in its artists, their data and labels; a file says only that it exists.
+    """
+
+    @contextmanager
+    def collected() -> Iterator[dict[str, Figure]]:
+        figures, plain = {}, Figure.savefig
+
+        def savefig(self: Figure, path: str | Path, **options: object) -> None:
+            figures[Path(path).name] = self
+            plain(self, path, **options)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Figure, "savefig", savefig)
+            yield figures
+
+    return collected

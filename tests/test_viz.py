@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy import stats
 
 from jaxsimp import goals, viz
 from jaxsimp.bodies import cloth, from_mesh, rope
 from jaxsimp.bodies.garments import skirt
+from jaxsimp.bodies.meshes import boundary_edges
 from jaxsimp.simplification import FitStatus, KeyPoints
 
 
@@ -100,6 +102,17 @@ def test_models_are_drawn_over_their_goals():
         "cloth: 4 key points",
         "third: 3 key points",
     ]
+    first, second, _ = figure.axes
+    for axes, body, model in ((first, line, rope_model()), (second, flat, cloth_model())):
+        assert_is_at(axes, body, goals.flat(body))
+        stars = axes.collections[-1]
+        np.testing.assert_allclose(np.transpose(stars._offsets3d), model.positions)
+        # Segments, or triangles that end where they begin; a rope's goal is a line, too.
+        elements = axes.lines[-len(model.elements) :]
+        for element, artist in zip(model.elements, elements, strict=True):
+            corners = element if len(element) == 2 else [*element, element[0]]
+            drawn = np.transpose(artist.get_data_3d())
+            np.testing.assert_allclose(drawn, model.positions[corners])
     figure.canvas.draw()
 
 
@@ -149,6 +162,17 @@ def test_costs_that_are_not_finite_are_left_out():
     assert np.isnan(figure.axes[0].lines[1].get_ydata()).all()
 
 
+def assert_is_at(axes, body, positions):
+    """The body that is drawn is at these positions: a rope's line, or a cloth's boundary."""
+    if len(body.faces):
+        (outline,) = (each for each in axes.collections if isinstance(each, Line3DCollection))
+        drawn = np.concatenate(outline._segments3d)
+        wanted = np.concatenate(positions[boundary_edges(body.faces)])
+    else:
+        drawn, wanted = np.transpose(axes.lines[0].get_data_3d()), positions
+    np.testing.assert_allclose(drawn, wanted)
+
+
 @pytest.mark.parametrize("body", [rope(9), cloth((5, 5))], ids=["rope", "cloth"])
 def test_executions_are_drawn_frame_by_frame(body):
     start = goals.flat(body)
@@ -161,6 +185,8 @@ def test_executions_are_drawn_frame_by_frame(body):
     assert titles[6] == "settled, score -1.00"
     limits = {(axes.get_xlim(), axes.get_ylim()) for axes in figure.axes}
     assert len(limits) == 1  # one scale: frames can be compared
+    for axes, frame in zip(figure.axes, [*frames, start] * 2, strict=True):
+        assert_is_at(axes, body, frame)
     figure.canvas.draw()
 
 
@@ -171,6 +197,8 @@ def test_an_execution_that_failed_is_drawn_without_its_lost_frames(body):
     figure = viz.plot_executions(body, start, {"failed": (frames, -np.inf)}, "a_task")
     figure.canvas.draw()
     assert np.all(np.isfinite(figure.axes[0].get_xlim()))
+    drawn = [bool(axes.lines or axes.collections) for axes in figure.axes]
+    assert drawn == [True, False, False, True]
 
 
 def ball():

@@ -20,8 +20,15 @@ from experiments.benchmark.measure import (
 )
 from jaxsimp import goals
 from jaxsimp.bodies import cloth
-from jaxsimp.dynamics import NONE, Actions, at_rest, largest_time_step, make_pickers, rollout
-from jaxsimp.dynamics.simulation import make_simulation
+from jaxsimp.dynamics import (
+    NONE,
+    Actions,
+    at_rest,
+    largest_time_step,
+    make_pickers,
+    make_simulation,
+    rollout,
+)
 from jaxsimp.engines import Layout, PopulationMap
 
 ACTION_SECONDS = 0.25

@@ -26,8 +26,13 @@ from jaxsimp.bodies import rope
 from jaxsimp.machine import num_cores
 from jaxsimp.planning import CEM, Plan, Planner
 from jaxsimp.simplification import qp, simplify
-from jaxsimp.simplification.ropes.fit import Limits, fit_within
-from jaxsimp.simplification.ropes.uniform import fit_rope, interpolation_matrix, uniform_breakpoints
+from jaxsimp.simplification.ropes import (
+    Limits,
+    fit_rope,
+    fit_within,
+    interpolation_matrix,
+    uniform_breakpoints,
+)
 from jaxsimp.tasks import make_task
 
 PLANNED_STEPS = (4, 150)

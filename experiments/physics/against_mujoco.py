@@ -14,7 +14,7 @@ from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions
 from jaxsimp.engines import MassSprings, replay
-from jaxsimp.engines.mujoco.model import make_model
+from jaxsimp.engines.mujoco import make_model
 from jaxsimp.tasks import Episode, Task, make_task, score
 from jaxsimp.viz import COLORS
 

@@ -15,14 +15,15 @@ from jaxsimp.tasks import garments
 
 # isort: split
 from jaxsimp.tasks.costs import MatchingCost, distance_cost, matching_distance
-from jaxsimp.tasks.crumple import crumple
-from jaxsimp.tasks.episode import Episode, EpisodeFn, RunningCost, TerminalCost
+from jaxsimp.tasks.crumpling import crumple
+from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
 from jaxsimp.tasks.registry import TaskFactory, make_task, register, task_names
 from jaxsimp.tasks.starts import CrumpledStart, FixedStart, TurnedStart
 from jaxsimp.tasks.task import Task, score
 
 __all__ = [
     "CrumpledStart",
+    "DrawFn",
     "Episode",
     "EpisodeFn",
     "FixedStart",

@@ -1,4 +1,4 @@
-"""What is refused when a task is made: numbers out of range, and costs that JAX cannot compile."""
+"""What a task refuses when it is made: numbers out of range, functions that JAX cannot compile."""
 
 import inspect
 from collections.abc import Callable
@@ -8,10 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+import numpy as np
+from jaxtyping import Array, PyTree
 
 from jaxsimp.dynamics import NONE, Actions, State, at_rest
-from jaxsimp.tasks.episode import Episode, RunningCost, TerminalCost
+from jaxsimp.tasks.episode import DrawFn, Episode, RunningCost, TerminalCost
 
 
 def check_count(name: str, value: object, least: int) -> None:
@@ -68,6 +69,26 @@ def check_costs(
     _check_cost("terminal_cost", terminal_cost, examples, ("episode", "state"))
 
 
+def check_draw(draw_fn: DrawFn, num_particles: int) -> None:
+    """Refuse what draws no episode of `num_particles` by a key, in pure JAX.
+
+    Raises:
+        ValueError: if it fails, or returns anything else.
+    """
+
+    def draw() -> list[Array | np.ndarray]:
+        found = draw_fn(jax.random.key(0))
+        return [found.start, found.goal] if isinstance(found, Episode) else []
+
+    found = _trace("draw_fn", draw, "it must accept a key, as made by jax.random.key")
+    shapes = [array.shape for array in found]
+    if shapes != [(num_particles, 3)] * 2:
+        raise ValueError(
+            f"draw_fn returns {f'arrays of shapes {shapes}' if shapes else 'no Episode'}; return "
+            f"an Episode of start and goal, shape ({num_particles}, 3) each"
+        )
+
+
 def _examples(num_particles: int, num_pickers: int) -> tuple[Episode, State, Actions]:
     positions = jnp.zeros((num_particles, 3))
     action = Actions(jnp.full(num_pickers, NONE), jnp.zeros((num_pickers, 3)))
@@ -92,7 +113,8 @@ def _check_cost(
             f"{name} is called as {name}({', '.join(arguments)}), which fails: {error}; give a "
             f"function of these arguments"
         ) from error
-    found = _trace(name, lambda: cost(*examples()[: len(arguments)]))
+    remedy = "it must accept positions of shape (N, 3), and an action of shapes (G,) and (G, 3)"
+    found = _trace(name, lambda: cost(*examples()[: len(arguments)]), remedy)
     if not isinstance(found, jax.ShapeDtypeStruct):
         raise ValueError(f"{name} returns a {type(found).__name__}; return one float, as a scalar")
     if found.shape != ():
@@ -103,8 +125,8 @@ def _check_cost(
         raise ValueError(f"{name} returns a scalar of type {found.dtype}; return a float")
 
 
-def _trace(name: str, call: Callable[[], Any]) -> PyTree[Any]:
-    """Shape and type of what a call of a cost returns."""
+def _trace(name: str, call: Callable[[], Any], remedy: str) -> PyTree[Any]:
+    """Shapes and types of what a call returns; a failure of it is refused with the remedy."""
     try:
         return jax.eval_shape(call)
     except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
@@ -115,10 +137,7 @@ def _trace(name: str, call: Callable[[], Any]) -> PyTree[Any]:
         ) from error
     except Exception as error:
         said = (str(error).splitlines() or [""])[0]
-        raise ValueError(
-            f"{name} fails with {type(error).__name__}: {said}; it must accept positions of shape "
-            f"(N, 3), and an action of shapes (G,) and (G, 3)"
-        ) from error
+        raise ValueError(f"{name} fails with {type(error).__name__}: {said}; {remedy}") from error
 
 
 def _is_positive(value: object) -> bool:

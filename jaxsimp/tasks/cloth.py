@@ -76,13 +76,13 @@ def _fold_task(
         moving: ids of the particles of the moving half, shape (M,).
         mirror: id of the mirror image of each particle, shape (N,).
     """
-    cost = FoldCost(moving, mirror[moving])
-
     goal = goals.fold(body, goals.flat(body), np.zeros(2), np.array(direction))
+    start, cost = TurnedStart(body, goal), FoldCost(moving, mirror[moving])
     return Task(
         body=body,
         goal=goal,
-        episode_fn=TurnedStart(body, goal),
+        episode_fn=start,
+        draw_fn=start.draw,
         running_cost=cost,
         terminal_cost=cost,
         limits=(0.2, 0.2, 0.2),
@@ -119,10 +119,12 @@ def flat_task(body: Body, goal: goals.Positions, num_actions: int) -> Task:
 
     The cost is the mean distance of the particles to their goals.
     """
+    start = TurnedStart(body, goal)
     return Task(
         body=body,
         goal=goal,
-        episode_fn=TurnedStart(body, goal),
+        episode_fn=start,
+        draw_fn=start.draw,
         running_cost=distance_cost,
         terminal_cost=distance_cost,
         limits=(0.2, 0.2, 0.2),

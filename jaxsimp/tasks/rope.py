@@ -60,12 +60,13 @@ def rope_folding(resolution: int) -> Task:
     height = np.sqrt(3) / 2 * side
     corners = np.array([[-side / 2, -height / 2], [0.0, height / 2], [side / 2, -height / 2]])
     goal = goals.polyline(body, corners)
-    cost = MatchingCost(resolution)
+    start, cost = FixedStart(Episode(goals.straight(body), goal)), MatchingCost(resolution)
     return Task(
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=FixedStart(Episode(goals.straight(body), goal)),
+        episode_fn=start,
+        draw_fn=start.draw,
         running_cost=cost,
         terminal_cost=cost,
     )
@@ -94,11 +95,13 @@ def rope_crossed_triangle(resolution: int) -> Task:
 
 def _shape_task(body: Body, goal: goals.Positions) -> Task:
     """A goal from a straight start; the cost is the mean distance of particles to their goals."""
+    start = FixedStart(Episode(goals.straight(body), goal))
     return Task(
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=FixedStart(Episode(goals.straight(body), goal)),
+        episode_fn=start,
+        draw_fn=start.draw,
         running_cost=distance_cost,
         terminal_cost=distance_cost,
         num_actions=6,

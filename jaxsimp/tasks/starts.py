@@ -1,12 +1,19 @@
-"""Starts and goals of episodes: always the same, turned at random, or crumpled."""
+"""Starts and goals of episodes: always the same, turned at random, or crumpled.
+
+Called with a seed they make an episode in NumPy. Those that need no simulation also `draw` one by
+a key, in pure JAX.
+"""
 
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
-from jaxsimp.tasks.crumple import crumple
+from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.episode import Episode
 
 LARGEST_ANGLE = np.pi / 4
@@ -27,6 +34,10 @@ class FixedStart:
         """The episode."""
         return self.episode
 
+    def draw(self, key: PRNGKeyArray) -> Episode:
+        """The episode as arrays of JAX, whatever the key."""
+        return jax.tree.map(_as_float, self.episode)
+
 
 @dataclass(frozen=True, eq=False)
 class TurnedStart:
@@ -45,6 +56,12 @@ class TurnedStart:
         angle = np.random.default_rng(seed).uniform(-LARGEST_ANGLE, LARGEST_ANGLE)
         return Episode(goals.flat(self.body, angle), goals.turn(self.goal, angle))
 
+    def draw(self, key: PRNGKeyArray) -> Episode:
+        """The episode of a key; another one than that of any seed."""
+        angle = jax.random.uniform(key, minval=-LARGEST_ANGLE, maxval=LARGEST_ANGLE)
+        start, goal = goals.flat(self.body), self.goal
+        return Episode(_turn(_as_float(start), angle), _turn(_as_float(goal), angle))
+
 
 @dataclass(frozen=True, eq=False)
 class CrumpledStart:
@@ -61,3 +78,14 @@ class CrumpledStart:
     def __call__(self, seed: int) -> Episode:
         """The episode of a seed; it takes a simulation."""
         return Episode(crumple(self.body, seed), self.goal)
+
+
+def _turn(positions: Float[Array, "N 3"], angle: Float[Array, ""]) -> Float[Array, "N 3"]:
+    """`goals.turn` in JAX, without the matrix product that some devices round coarsely."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    x, y, z = positions.T
+    return jnp.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+
+
+def _as_float(positions: goals.Positions) -> Float[Array, "N 3"]:
+    return jnp.asarray(positions, dtype=float)

@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
@@ -16,8 +17,8 @@ from jaxsimp.dynamics import (
     make_pickers,
     make_simulation,
 )
-from jaxsimp.tasks.check import check_costs, check_count, check_limits, check_seconds
-from jaxsimp.tasks.episode import Episode, EpisodeFn, RunningCost, TerminalCost
+from jaxsimp.tasks.check import check_costs, check_count, check_draw, check_limits, check_seconds
+from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +39,14 @@ class Task:
         settle_actions: as many times `action_seconds` pass, with nothing held, after the
             last action and before the plan is scored.
         longest_time_step: bound on the time step of the simulation, seconds.
+        draw_fn: from a key to start and goal, pure JAX; None where starts are made by seed only.
         name: of a registered task that of its factory, see `register`.
         resolution: that a registered task was made with, see `make_task`; None of another one.
 
     Raises:
         ValueError: if the goal is refused (see `goals.check_goal`), a number is out of its range,
-            or a cost cannot be compiled or is no float scalar.
+            a cost cannot be compiled or is no float scalar, or `draw_fn` draws no episode of
+            the body.
     """
 
     body: Body
@@ -57,6 +60,7 @@ class Task:
     action_seconds: float = 0.3
     settle_actions: int = 4
     longest_time_step: float = 2e-3
+    draw_fn: DrawFn | None = None
     name: str = "unnamed"
     resolution: int | None = None
 
@@ -70,6 +74,23 @@ class Task:
         check_costs(
             self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
         )
+        if self.draw_fn is not None:
+            check_draw(self.draw_fn, self.body.num_particles)
+
+    def draw_episode(self, key: PRNGKeyArray) -> Episode:
+        """A random episode, drawn by a key: pure JAX, to which `jit` and `vmap` over keys apply.
+
+        The starts are as those of `episode_fn`; the start of no key is that of a seed.
+
+        Raises:
+            ValueError: if the starts of this task are made by seed only.
+        """
+        if self.draw_fn is None:
+            raise ValueError(
+                f"the task {self.name!r} has no draw_fn, as its starts may need a simulation; use "
+                f"episode_fn(seed), or give the task a draw_fn"
+            )
+        return self.draw_fn(key)
 
     def simulation(self, *, self_contact: bool = False) -> Simulation:
         """The body's simulation, at the task's time step.
@@ -109,7 +130,9 @@ def score(
 ) -> Float[Array, ""]:
     """Normalised score `(c_0 - c) / c_0`: 1 where the cost is 0, 0 where it is that of the start.
 
-    `c_0` and `c` are terminal costs of the start, at rest, and of the state.
+    `c_0` and `c` are terminal costs of the start, at rest, and of the state. Of a start that costs
+    nothing the score is the limit of small `c_0`: 1 where `c` is 0, too, and minus infinity where
+    it is more. The score is not a number only where a cost is none.
 
     Args:
         task: what is asked.
@@ -118,4 +141,8 @@ def score(
     """
     state = state if isinstance(state, State) else at_rest(state)
     start = task.terminal_cost(episode, at_rest(episode.start))
-    return (start - task.terminal_cost(episode, state)) / start
+    cost = task.terminal_cost(episode, state)
+    relative = start != 0
+    ratio = (start - cost) / jnp.where(relative, start, 1.0)
+    of_free_start = jnp.where(cost > 0, -jnp.inf, 1.0 - cost)  # not a number where the cost is none
+    return jnp.where(relative, ratio, of_free_start)

@@ -422,10 +422,17 @@ def over(start: np.ndarray, end: np.ndarray, lift: float) -> np.ndarray:
 
 @pytest.mark.slow
 def test_twice_folded_cloths_settle_with_no_particles_closer_than_their_thickness_allows():
+    """A stack never lies quite still, and which pair comes how close is chance: a rate is asserted.
+
+    Of 200 such cloths 2 have a pair closer than 80 % of the thickness (docs/physics.md). At that
+    rate more than 2 of 20 have one with a probability of 0.1 %; where one in three has, 2 or fewer
+    of 20 do with 2 %.
+    """
     body = cloth()
     simulation = make_simulation(body, 0.9 * largest_time_step(body), self_contact=True)
     pickers = make_pickers((0.2, 0.2, 0.2), steps=127)
     run = jax.jit(lambda state, actions: rollout(simulation, pickers, state, actions)[0])
+    closest = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
         state = at_rest(goals.flat(body, rng.uniform(-np.pi / 4, np.pi / 4)))
@@ -439,8 +446,11 @@ def test_twice_folded_cloths_settle_with_no_particles_closer_than_their_thicknes
             grasped = np.tile(picks, (8, 1))
             grasped[4:] = NONE
             state = run(state, Actions(jnp.asarray(grasped), jnp.asarray(moves, jnp.float32)))
-        assert colliding_distances(simulation, state.position).min() > 0.8 * 2 * body.radius
         assert np.ptp(state.position[:, 2]) > 3 * 2 * body.radius  # four layers
+        closest.append(colliding_distances(simulation, state.position).min() / (2 * body.radius))
+    assert np.sum(np.array(closest) < 0.8) <= 2
+    # Nobody passes through: the closest of the 200 is at 69 %.
+    assert min(closest) > 0.5
 
 
 # Transformations

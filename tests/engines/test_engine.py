@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxsimp import goals
-from jaxsimp.dynamics import NONE, Actions, State
-from jaxsimp.engines import Engine, MassSprings
+from jaxsimp.dynamics import NONE, Actions, State, at_rest
+from jaxsimp.engines import MassSprings
 from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner
 from jaxsimp.tasks import make_task
 
@@ -106,7 +106,28 @@ def test_an_engine_that_refuses_the_task_is_heard():
         Planner(task, CONFIG, engine=Gliding(1.0))
 
 
-def test_what_counts_as_an_engine():
-    assert isinstance(MassSprings(), Engine)
-    assert isinstance(Gliding(1.0), Engine)
-    assert not isinstance(object(), Engine)
+@pytest.mark.parametrize("engine", [MassSprings(), Gliding(0.5)], ids=["springs", "gliding"])
+def test_a_rollout_observes_the_state_after_each_action_and_goes_on_from_any(engine):
+    """What the planner asks of whatever is an engine."""
+    task = dataclasses.replace(make_task("rope_letter_u", 5), action_seconds=0.05)
+    physics = engine.physics(task)
+    pick = jnp.array([[0, NONE], [4, 0], [NONE, NONE]])
+    moves = jnp.linspace(-0.05, 0.1, 18).reshape(3, 2, 3)
+    first, rest = (Actions(pick[part], moves[part]) for part in (slice(0, 1), slice(1, None)))
+    start = at_rest(task.episode_fn(0).start)
+
+    def observe(state):
+        return {"tip": state.position[0], "height": state.position[:, 2].mean()}
+
+    final, seen = engine.rollout(physics, start, Actions(pick, moves), observe)
+    assert seen["tip"].shape == (3, 3)
+    assert seen["height"].shape == (3,)
+    between, before = engine.rollout(physics, start, first, observe)
+    after, later = engine.rollout(physics, between, rest, observe)
+    assert np.abs(after.position - start.position).max() > 0.01
+    # The same steps in loops of other lengths, in float32, of 0.3 m.
+    np.testing.assert_allclose(final.position, after.position, atol=1e-6)
+    for name in ("tip", "height"):
+        joined = np.concatenate([before[name], later[name]])
+        np.testing.assert_allclose(seen[name], joined, atol=1e-6)
+        np.testing.assert_allclose(seen[name][-1], observe(final)[name], atol=1e-6)

@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from experiments import run, simplification
+from experiments import run, simplification, simplification_report
 from experiments.ideal_goals import FOLDS, LINES, NOISES
 from experiments.settled_goals import SETTLED_FOLDS
 from experiments.simplification import CLOTH_LEVELS, ROPE_LEVELS, ROWS_FILE, Study
@@ -76,10 +76,11 @@ def test_an_unknown_study_is_named_with_the_choices(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_a_study_leaves_a_report_and_goes_on_after_a_kill(tmp_path, monkeypatch):
+def test_a_study_leaves_a_report_and_goes_on_after_a_kill(tmp_path, monkeypatch, figures_saved):
     folder = tmp_path / "results"
     options = ("--smoke", "--methods", "robust", "paper", "--out", folder)
-    assert command(*options) == 0
+    with figures_saved() as figures:
+        assert command(*options) == 0
     summary = json.loads((folder / "summary.json").read_text())
     rows = summary["goals"]
     count = len(LINES) + len(FOLDS) + len(SETTLED_FOLDS)
@@ -89,7 +90,23 @@ def test_a_study_leaves_a_report_and_goes_on_after_a_kill(tmp_path, monkeypatch)
     report = (folder / "report.md").read_text()
     for name in ("rates", "goals", "errors", "models_robust", "models_paper"):
         assert f"figures/{name}.png" in report
-        assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000
+        assert (folder / "figures" / f"{name}.png").exists()
+    (goals,) = figures["goals.png"].axes
+    assert [label.get_text() for label in goals.get_yticklabels()] == ["robust", "paper"]
+    right = Counter((row["method"], row["name"]) for row in rows if row["right"])
+    names = [label.get_text() for label in goals.get_xticklabels()]
+    assert set(names) == {*LINES, *FOLDS}
+    # Each goal once: all or nothing of it is right.
+    wanted = [100 * right[method, name] for method in ("robust", "paper") for name in names]
+    assert [text.get_text() for text in goals.texts] == [f"{each}" for each in wanted]
+    kinds = [axes.get_title() for axes in figures["rates.png"].axes]
+    assert kinds == ["ropes, 1 m", "cloths, 0.3 m", "cloths settled in a simulation"]
+    for method in ("robust", "paper"):
+        titles = [axes.get_title() for axes in figures[f"models_{method}.png"].axes]
+        assert len(titles) == len(simplification_report.SHOWN)
+        for title, name in zip(titles, simplification_report.SHOWN, strict=True):
+            assert title.startswith(f"{name}, ")
+            assert title.endswith("key points")
     # Cut in the middle of a line, as by a kill: the rest is run again, and only that.
     lines = (folder / ROWS_FILE).read_text().splitlines(keepends=True)
     (folder / ROWS_FILE).write_text("".join(lines[:-3]) + lines[-3][:20])

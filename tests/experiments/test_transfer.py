@@ -8,7 +8,6 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import matplotlib.image
 import numpy as np
 import pytest
 
@@ -39,11 +38,17 @@ def finished(folder: Path) -> dict:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """The results of a tiny study."""
+def results(tmp_path_factory, figures_saved):
+    """The results of a tiny study, and its figures by the names of their files."""
     folder = tmp_path_factory.mktemp("results") / "tiny"
-    assert command(*OPTIONS, "--out", folder) == 0
-    return folder
+    with figures_saved() as figures:
+        assert command(*OPTIONS, "--out", folder) == 0
+    return folder, figures
+
+
+@pytest.fixture(scope="module")
+def folder(results):
+    return results[0]
 
 
 @pytest.mark.slow
@@ -82,16 +87,30 @@ def test_scores_are_those_of_the_settled_positions(folder, variant):
 
 
 @pytest.mark.slow
-def test_report_and_figures_are_there(folder):
+def test_figures_show_the_scores_and_the_report_shows_the_figures(results):
+    folder, figures = results
+    summary = finished(folder)
     report = (folder / "report.md").read_text()
     names = {path.stem for path in (folder / "figures").iterdir()}
     shown = {f"{kind}_{task}" for kind in ("median", "worst", "by_hand") for task in TASKS}
     assert names == {"transfer", *shown}
     for name in names:
         assert f"(figures/{name}.png)" in report
-        assert len(np.unique(matplotlib.image.imread(folder / "figures" / f"{name}.png"))) > 10
     for task in TASKS:
         assert report.count(f"| {task} |") == 2
+    # There is one plan of each kind.
+    for index, task in enumerate(TASKS):
+        found, by_hand = summary["transfer"][index], summary["scripted"][index]
+        *_, first, second = figures["transfer.png"].axes[index].lines
+        for line, row in ((first, found), (second, by_hand)):
+            drawn = [line.get_xdata()[0], line.get_ydata()[0]]
+            assert drawn == [row["final_score"], row["mujoco_full_score"]]
+        for kind, row in (("median", found), ("worst", found), ("by_hand", by_hand)):
+            titles = [axes.get_title() for axes in figures[f"{kind}_{task}.png"].axes]
+            scores = [row[f"{engine}_score"] for engine in ("final", "mujoco_fast", "mujoco_full")]
+            assert [title for title in titles if title.startswith("settled")] == [
+                f"settled, score {score:.2f}" for score in scores
+            ]
 
 
 @pytest.mark.slow
@@ -162,7 +181,7 @@ def test_what_judges_plans_is_part_of_what_a_study_is():
     rounds = [each["search"]["rope_folding"]["num_iterations"] for each in (nominal, touching)]
     assert rounds == [3, 2]  # half of them, for each takes longer
     assert robust["ensemble"]["size"] == 4
-    assert [run.results_folder(each).name for each in options] == [
+    assert [each.folder().name for each in options] == [
         "transfer-nominal-smoke",
         "transfer-robust-smoke",
         "transfer-self_contact-smoke",

@@ -7,12 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxsimp.dynamics import NONE, Actions, at_rest
-from jaxsimp.tasks import Task, make_task, task_names
+from jaxsimp.tasks import Episode, Task, make_task, task_names
 
 # --- pickling -------------------------------------------------------------------------------------
 
@@ -43,13 +44,14 @@ assert jax.local_device_count() == 3
 
 
 def numbers(task: Task) -> list[np.ndarray]:
-    """Start, goal, and both costs of the start moved at random."""
+    """Start, goal, both costs of the start moved at random, and what a key draws."""
     episode = task.episode_fn(1)
+    drawn = () if task.draw_fn is None else jax.tree.leaves(task.draw_episode(jax.random.key(2)))
     moved = episode.start + 0.05 * np.random.default_rng(0).standard_normal(episode.start.shape)
     action = Actions(jnp.full(task.num_pickers, NONE), jnp.zeros((task.num_pickers, 3)))
     state = at_rest(moved)
     costs = task.running_cost(episode, state, action), task.terminal_cost(episode, state)
-    return [np.asarray(array) for array in (episode.start, episode.goal, *costs)]
+    return [np.asarray(array) for array in (episode.start, episode.goal, *costs, *drawn)]
 
 
 # The start of a crumpled rope takes the compilation of a simulation.
@@ -193,6 +195,30 @@ def test_a_running_cost_sees_an_action_of_all_pickers():
 
     changed(running_cost=effort, num_pickers=3)
     assert seen == [((3,), (3, 3))]
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("draw_fn", "said"),
+    [
+        (
+            lambda key: key,
+            r"returns no Episode; return an Episode of .*shape \(9, 3\)",
+        ),
+        (
+            lambda key: Episode(jnp.zeros((9, 3)), jnp.zeros((8, 3))),
+            r"returns arrays of shapes .*\(8, 3\).*shape \(9, 3\) each",
+        ),
+        (
+            lambda key: Episode(*np.random.default_rng(int(key)).uniform(size=(2, 9, 3))),
+            r"asks for the values of arrays",
+        ),
+        (lambda: None, r"fails with TypeError: .*; it must accept a key"),
+    ],
+)
+def test_what_draws_no_episode_by_a_key_is_refused(draw_fn, said):
+    with pytest.raises(ValueError, match=f"^draw_fn {said}"):
+        changed(draw_fn=draw_fn)
 
 
 def test_costs_are_traced_and_nothing_is_computed():
