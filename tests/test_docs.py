@@ -20,7 +20,7 @@ import jaxsimp
 import jaxsimp.tasks
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SMALL = {"make_task": {"quick": True}}
 """Functions of the face that blocks call at another size than the reader: arguments by default."""
