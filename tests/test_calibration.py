@@ -271,6 +271,17 @@ def test_durations_that_are_none_are_refused(seconds):
         simulate_recordings(ROPE, [good()], seconds)
 
 
+def test_the_material_of_a_calibrated_body_makes_that_body():
+    factors = {"stiffness": np.array([2.0, 3.0]), "drag": np.array(0.5), "damping": np.array(4.0)}
+    found = _scaled_body(ROPE, factors, _check_kinds(ROPE, None))
+    again = rope(6, 0.2, material=found.material)
+    for name in ("stiffness", "damping", "mass"):
+        # A few products and quotients in float64.
+        np.testing.assert_allclose(getattr(again, name), getattr(found, name), rtol=1e-14)
+    assert again.material.drag == 0.5 * ROPE.material.drag
+    assert again.material.friction == ROPE.material.friction
+
+
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="drag of the body is 0"):

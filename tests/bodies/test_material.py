@@ -51,6 +51,8 @@ def test_names_that_are_no_parameters_are_refused_with_those_that_are():
     # Its arrays would not follow.
     with pytest.raises(TypeError, match="density is no parameter here; choose from mass"):
         rope().scaled(density=2.0)
+    with pytest.raises(TypeError, match="bend_stiffness is no parameter here; choose from mass"):
+        rope().scaled(bend_stiffness=2.0)
 
 
 @given(values=st.fixed_dictionaries(dict.fromkeys(FACTORS, factors)))

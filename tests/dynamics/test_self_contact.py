@@ -385,7 +385,7 @@ def test_pickers_too_fast_for_the_thickness_are_refused():
     make_simulation(body, 1e-3, self_contact=True, top_speed=4.39)
     with pytest.raises(ValueError, match=r"4\.41 m/s; layers of 4 mm .* up to 4\.39"):
         make_simulation(body, 1e-3, self_contact=True, top_speed=4.41)
-    with pytest.raises(ValueError, match=r"thickness is 0; .* give one above zero"):
+    with pytest.raises(ValueError, match=r"thickness is 0; .* give metres above zero"):
         make_self_contact(body.scaled(thickness=0.0), 1e-3)
     with pytest.raises(ValueError, match="at least 1 time step"):
         make_self_contact(body, 1e-3, interval=0)

@@ -98,7 +98,9 @@ def make_self_contact(
     """
     thickness = body.material.thickness
     if not thickness > 0:
-        raise ValueError("thickness is 0; self-contact needs layers of some: give one above zero")
+        raise ValueError(
+            "thickness is 0; self-contact holds layers that far apart: give metres above zero"
+        )
     if interval < 1:
         raise ValueError(f"interval is {interval}; contact acts after at least 1 time step")
     friction = body.material.friction if friction is None else friction
