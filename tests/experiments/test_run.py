@@ -207,7 +207,9 @@ def test_a_study_cut_short_in_a_row_goes_on_to_the_same_runs(folder, tmp_path):
 @pytest.mark.slow
 def test_a_killed_process_goes_on_to_the_same_runs(folder, tmp_path):
     out, rows = tmp_path / "killed", tmp_path / "killed" / "runs.jsonl"
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    # A copy of what is compiled: a file that the kill cuts short must not be read by others.
+    programs = shutil.copytree(os.environ["JAX_COMPILATION_CACHE_DIR"], tmp_path / "programs")
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_COMPILATION_CACHE_DIR": str(programs)}
     with subprocess.Popen(
         [sys.executable, "-m", "experiments.run", *OPTIONS, "--out", out],
         cwd=ROOT,

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import run
+from experiments import run, transfer
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
 from jaxsimp.engines import MassSprings, make_ensemble
-from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan
+from jaxsimp.engines.mujoco.model import VARIANTS
+from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
 from jaxsimp.records import read_rows
 from jaxsimp.tasks import make_task, score, task_names
 
@@ -149,14 +150,14 @@ def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
 
 @pytest.mark.slow
 def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
-    options = (*OPTIONS, "--tasks", "rope_straightening", "--planning", "robust")
+    options = (*OPTIONS, "--tasks", "rope_folding", "--planning", "robust")
     out = tmp_path / "robust"
     assert command(*options, "--out", out) == 0
     (row,), (by_hand,) = finished(out)["transfer"], finished(out)["scripted"]
     assert (row["planning"], by_hand["planning"]) == ("robust", "scripted")
-    assert "| rope_straightening | key points | robust |" in (out / "report.md").read_text()
+    assert "| rope_folding | key points | robust |" in (out / "report.md").read_text()
     # The search's cost of the plan is the one of the ensemble, not that of the body's own physics.
-    task = make_task("rope_straightening", 7)
+    task = make_task("rope_folding", 7)
     task = dataclasses.replace(task, num_actions=1)
     plan = jax.tree.map(lambda array: array[None], load_plan(out / row["plan"])[0])
     robust, nominal = (
@@ -203,6 +204,21 @@ def test_plans_with_self_contact_are_those_of_its_physics(tmp_path):
     execution = planner.execute(task.episode_fn(0), plan)
     assert execution.missed is not None
     assert found["final_score"] == pytest.approx(execution.score, abs=1e-5)  # float32
+
+
+@pytest.mark.slow
+def test_a_plan_is_replayed_from_the_start_that_it_was_made_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(transfer, "VARIANTS", {"fast": VARIANTS["fast"]})
+    (tmp_path / transfer.REPLAYS_FOLDER).mkdir()
+    task, seed = make_task("cloth_side_folding", 5), 3
+    plan = scripted_plan(task, task.episode_fn(seed))
+    path = tmp_path / "plan.npz"
+    save_plan(path, plan, np.zeros((task.num_actions + 2, 25, 3)))
+    row = {"task": task.name, "action_space": "scripted", "seed": seed, "plan": path.name}
+    (done,) = transfer._replay_task(task, [transfer.Case(row, path)], tmp_path)
+    assert done["mujoco_fast_score"] > 0.5  # of another start the corners are elsewhere
+    frames = load_plan(replay_path(tmp_path, row, "fast"))[1]["positions"]
+    np.testing.assert_allclose(frames[0], task.episode_fn(seed).start, atol=1e-7)  # float32
 
 
 def test_robust_is_refused_for_plans_that_are_found(tmp_path, capsys):
