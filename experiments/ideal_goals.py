@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from jaxsimp.bodies import Body
 from jaxsimp.goals import Positions
-from jaxsimp.simplification.key_points import KeyPoints
+from jaxsimp.simplification import KeyPoints
 
 
 class Line(NamedTuple):

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
-from experiments.plans import PLANS_FOLDER, ROWS_FILE, Study, key_points
-from jaxsimp import viz
-from jaxsimp.planning import load_plan
-from jaxsimp.records import write_json
+from experiments.plans import PLANS_FOLDER, ROWS_FILE, PlanStudy, key_points
+from jaxsimp import records, viz
 
 Rows = list[dict[str, Any]]
 SUMMARY_FILE = "summary.json"
@@ -26,9 +24,9 @@ LABELS = {
 }
 
 
-def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
+def write_report(study: PlanStudy, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / SUMMARY_FILE, summary)
+    records.write_json(folder / SUMMARY_FILE, summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     tasks = {name: study.task(name) for name in study.tasks}
@@ -87,12 +85,12 @@ def _typical_plans(rows: Rows, folder: Path) -> dict[str, tuple[np.ndarray, floa
     """Positions and score of the plan of the typical seed, by method."""
     chosen = _methods(_of(rows, seed=_typical_seed(rows)))
     return {
-        method: (load_plan(folder / run["plan"])[1]["positions"], _score(run))
+        method: (records.load_plan(folder / run["plan"]).positions, _score(run))
         for method, (run,) in chosen.items()
     }
 
 
-def _report(study: Study, summary: dict[str, Any], transfer: Rows) -> str:
+def _report(study: PlanStudy, summary: dict[str, Any], transfer: Rows) -> str:
     lines = [
         f"# Goal-conditioned model simplification: the study {study.name!r}",
         "",
@@ -145,7 +143,7 @@ def _error(model: dict[str, Any]) -> float:
     return model["errors"][model["sizes"].index(len(model["key_points"]))]
 
 
-def _touching(study: Study) -> str:
+def _touching(study: PlanStudy) -> str:
     return "touches itself" if study.self_contact else "passes through itself"
 
 

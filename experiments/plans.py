@@ -16,11 +16,11 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from experiments.progress import progress_bar
 from jaxsimp import records
-from jaxsimp.engines import Ensemble, MassSprings, Spread, make_ensemble
-from jaxsimp.planning import ENCODINGS, CEMConfig, Planner, save_plan
+from jaxsimp.engines import MassSprings, SearchEngine, Spread, make_ensemble
+from jaxsimp.planning import CEM, ENCODINGS, Planner
 from jaxsimp.simplification import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
 
@@ -30,6 +30,8 @@ PLANNING = ("nominal", "robust", "self_contact", "mixed")
 or with self-contact where the body is a cloth, whose folds have layers."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
+IDENTITY = ("task", "action_space", "pick_encoding", "seed")
+"""Fields that tell a run from all others."""
 PLANS_FOLDER = "plans"
 
 
@@ -37,13 +39,13 @@ PLANS_FOLDER = "plans"
 class Budget:
     """How much a plan may cost: the search, and overrides of the task's plan shape."""
 
-    rope: CEMConfig
-    cloth: CEMConfig
-    garment: CEMConfig | None = None
+    rope: CEM
+    cloth: CEM
+    garment: CEM | None = None
     num_actions: int | None = None
     limit: float | None = None
 
-    def config(self, task: Task) -> CEMConfig:
+    def config(self, task: Task) -> CEM:
         """The search settings for a task's kind of body; a garment's are a cloth's by default."""
         if not len(task.body.faces):
             return self.rope
@@ -51,7 +53,7 @@ class Budget:
         return self.cloth if is_grid or self.garment is None else self.garment
 
 
-_PAPER = CEMConfig(
+_PAPER = CEM(
     num_iterations=20,
     initial_populations=1,
     smoothing=0.0,
@@ -60,7 +62,7 @@ _PAPER = CEMConfig(
     returns="mean",
 )
 BUDGETS = {
-    "default": Budget(rope=CEMConfig(num_iterations=24), cloth=CEMConfig(num_iterations=24)),
+    "default": Budget(rope=CEM(num_iterations=24), cloth=CEM(num_iterations=24)),
     "paper": Budget(
         rope=dataclasses.replace(_PAPER, population=70),
         cloth=dataclasses.replace(_PAPER, population=333),
@@ -68,20 +70,20 @@ BUDGETS = {
         limit=0.08,
     ),
     "goals": Budget(
-        rope=CEMConfig(num_iterations=24),
+        rope=CEM(num_iterations=24),
         # Several folds are found one after another: the search must not settle on the first.
-        cloth=CEMConfig(num_iterations=40, smoothing=0.2),
-        garment=CEMConfig(num_iterations=24),
+        cloth=CEM(num_iterations=40, smoothing=0.2),
+        garment=CEM(num_iterations=24),
     ),
     "smoke": Budget(
-        rope=CEMConfig(num_iterations=3, population=16, initial_populations=1),
-        cloth=CEMConfig(num_iterations=3, population=16, initial_populations=1),
+        rope=CEM(num_iterations=3, population=16, initial_populations=1),
+        cloth=CEM(num_iterations=3, population=16, initial_populations=1),
     ),
 }
 
 
 @dataclass(frozen=True)
-class Study:
+class PlanStudy:
     """One configuration of the study: what makes two results comparable.
 
     Attributes:
@@ -137,7 +139,7 @@ class Study:
         limits = (budget.limit,) * 3 if budget.limit else task.limits
         return dataclasses.replace(task, num_actions=num_actions, limits=limits)
 
-    def search_config(self, task: Task) -> CEMConfig:
+    def search_config(self, task: Task) -> CEM:
         """The search settings of a task."""
         config = BUDGETS[self.budget].config(task)
         if self.planning_of(task) == "self_contact":
@@ -152,15 +154,16 @@ class Study:
             return self.planning
         return "self_contact" if len(task.body.faces) else "nominal"
 
-    def ensemble(self, task: Task) -> Ensemble | None:
-        """The physics that plans are judged in, if it is not the body's own alone."""
-        return make_ensemble(task, ENSEMBLE_SIZE) if self.planning == "robust" else None
+    def engine(self, task: Task) -> SearchEngine:
+        """The physics that the search costs plans in."""
+        planning = self.planning_of(task)
+        if planning == "robust":
+            return make_ensemble(task, ENSEMBLE_SIZE)
+        return MassSprings(self_contact=planning == "self_contact")
 
     def identity(self) -> dict[str, Any]:
         """What two folders of results must share: the options, and what their names mean."""
-        search = {
-            name: dataclasses.asdict(self.search_config(self.task(name))) for name in self.tasks
-        }
+        search = {name: settings(self.search_config(self.task(name))) for name in self.tasks}
         spread = {"size": ENSEMBLE_SIZE, "spread": dataclasses.asdict(Spread())}
         ensemble = spread if self.planning == "robust" else None
         return {**dataclasses.asdict(self), "search": search, "ensemble": ensemble}
@@ -180,31 +183,29 @@ def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) ->
             raise ValueError(f"{kind} {name!r} is given twice; give it once")
 
 
-def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+def run_study(study: PlanStudy, folder: Path, console: Console) -> dict[str, Any]:
     """Run what is not in the folder yet, and return the summary of everything in it."""
     models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
-    rows = records.read_rows(folder / ROWS_FILE)
-    done = {_identity(row) for row in rows}
+    rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
+    runs = [(name, *run) for name in study.tasks for run in study.runs(name)]
+    todo = rows.left(runs)
     left = {
-        name: [run for run in study.runs(name) if (name, *run) not in done] for name in study.tasks
+        name: [(space, encoding, seed) for task, space, encoding, seed in todo if task == name]
+        for name in study.tasks
     }
-    if any(left.values()):
+    if todo:
         _run_all(study, models, left, folder, console)
-    order = [(name, *run) for name in study.tasks for run in study.runs(name)]
-    rows = sorted(
-        records.read_rows(folder / ROWS_FILE), key=lambda row: order.index(_identity(row))
-    )
     return {
         "environment": records.environment(),
         "models": [_model_row(name, model) for name, model in models.items()],
-        "runs": rows,
+        "runs": rows.in_order(runs),
     }
 
 
 def _run_all(
-    study: Study,
+    study: PlanStudy,
     models: dict[str, KeyPoints],
     left: dict[str, list[tuple[str, str, int]]],
     folder: Path,
@@ -213,35 +214,25 @@ def _run_all(
     """Compile, estimate, and run task by task, a row on disk after each run."""
     (folder / PLANS_FOLDER).mkdir(exist_ok=True)
     environment = records.environment()
-    planners, seconds = {}, {}
+    planners, seconds, compiled = {}, {}, {}
     for name in (name for name, runs in left.items() if runs):
         task = study.task(name)
-        planners[name] = Planner(
-            task,
-            study.search_config(task),
-            engine=MassSprings(self_contact=study.planning_of(task) == "self_contact"),
-            ensemble=study.ensemble(task),
-            judge=MassSprings(self_contact=study.self_contact),
-        )
-        seconds[name] = planners[name].estimate_seconds() * len(left[name])
+        evaluator = MassSprings(self_contact=study.self_contact)
+        planners[name] = Planner(task, study.engine(task), evaluator)
+        compiled[name] = planners[name].prepare(study.search_config(task))
+        seconds[name] = planners[name].estimate_seconds(study.search_config(task)) * len(left[name])
         console.print(
-            f"{name}: compiled in {planners[name].compile_seconds:.1f} s; "
+            f"{name}: compiled in {compiled[name]:.1f} s; "
             f"{len(left[name])} runs of about {seconds[name] / len(left[name]):.1f} s"
         )
     console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for what is left")
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    with progress_bar(console) as progress:
         for name, planner in planners.items():
-            bar = progress.add_task(name, total=len(left[name]) * planner.config.num_populations)
-            compile_seconds = planner.compile_seconds
+            algorithm, compile_seconds = study.search_config(planner.task), compiled[name]
+            bar = progress.add_task(name, total=len(left[name]) * algorithm.num_asks)
             for run in left[name]:
                 advance = partial(progress.advance, bar)
-                row = _run(planner, models[name], run, folder, advance)
+                row = _run(planner, algorithm, models[name], run, folder, environment, advance)
                 row["planning"] = study.planning_of(planner.task)
                 row["success"] = (row["final_score"] or 0.0) >= study.success_score
                 row["environment"] = environment
@@ -252,23 +243,35 @@ def _run_all(
 
 def _run(
     planner: Planner,
+    algorithm: CEM,
     model: KeyPoints,
     run: tuple[str, str, int],
     folder: Path,
-    on_population: Callable[[], None],
+    environment: dict[str, Any],
+    on_ask: Callable[[], None],
 ) -> dict[str, Any]:
     """Plan once, execute, save the plan, and return the row."""
     action_space, encoding, seed = run
     task = planner.task
-    everything = np.arange(task.body.num_particles)
-    candidates = everything[model.mask] if action_space == "key_points" else everything
+    candidates = model if action_space == "key_points" else np.arange(task.body.num_particles)
     episode = task.episode_fn(seed)
-    plan = planner.plan(episode, candidates, ENCODINGS[encoding], seed, on_population)
+    algorithm = dataclasses.replace(algorithm, encoding=ENCODINGS[encoding])
+    plan = planner.plan(episode, candidates, algorithm, seed, on_ask)
     execution = planner.execute(episode, plan.actions)
     file = f"{PLANS_FOLDER}/{task.name}-{action_space}-{encoding}-{seed}.npz"
-    save_plan(folder / file, plan.actions, execution.positions)
+    records.save_plan(
+        folder / file,
+        task,
+        episode,
+        plan.actions,
+        execution,
+        engine=planner.evaluator,
+        found={"algorithm": repr(algorithm), "seed": seed},
+        provenance=environment,
+    )
     score = execution.score if np.isfinite(execution.score) else None
-    found = plan.search
+    found, rounds = plan.optimum, slice(algorithm.initial_populations - 1, None)
+    elite_costs = found.traces[0]["elite_costs"][rounds]
     return {
         "task": task.name,
         "action_space": action_space,
@@ -276,31 +279,38 @@ def _run(
         "seed": seed,
         "num_particles": task.body.num_particles,
         "num_key_points": len(model),
-        "cost_per_iteration": [finite(cost) for cost in found.best_costs],
-        "elite_cost_per_iteration": [finite(cost) for cost in found.elite_costs],
-        "final_cost": finite(found.cost),
+        "cost_per_iteration": [finite(float(cost)) for cost in found.best_costs[rounds]],
+        "elite_cost_per_iteration": [finite(float(costs.mean())) for costs in elite_costs],
+        "final_cost": finite(float(found.cost)),
         "final_score": score,
         "missed_contacts": execution.missed,
-        "rollouts": found.num_rollouts,
-        "non_finite": found.non_finite,
+        "rollouts": plan.num_rollouts,
+        "non_finite": int(found.failed),
         "plan_seconds": plan.seconds,
         "compile_seconds": plan.compile_seconds,
         "plan": file,
-        "config": _row_config(planner),
+        "config": _row_config(planner, algorithm),
     }
 
 
-def _row_config(planner: Planner) -> dict[str, Any]:
+def settings(algorithm: CEM) -> dict[str, Any]:
+    """Settings of a search but for its encoding, which is told beside them."""
+    found = dataclasses.asdict(algorithm)
+    del found["encoding"]
+    return found
+
+
+def _row_config(planner: Planner, algorithm: CEM) -> dict[str, Any]:
     task = planner.task
     return {
-        **dataclasses.asdict(planner.config),
+        **settings(algorithm),
         "num_actions": task.num_actions,
         "num_pickers": task.num_pickers,
         "limits": list(task.limits),
         "time_step": task.time_step,
         "action_steps": task.action_steps,
         "settle_actions": task.settle_actions,
-        "layout": dataclasses.asdict(planner.layout),
+        "layout": dataclasses.asdict(planner.layout_of(algorithm)),
     }
 
 
@@ -309,14 +319,10 @@ def finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def key_points(study: Study, name: str) -> KeyPoints:
+def key_points(study: PlanStudy, name: str) -> KeyPoints:
     """The key points of a task's goal."""
     task = study.task(name)
     return simplify(task.body, task.goal, method=study.method)
-
-
-def _identity(row: dict[str, Any]) -> tuple[str, str, str, int]:
-    return row["task"], row["action_space"], row["pick_encoding"], row["seed"]
 
 
 def _model_row(task: str, model: KeyPoints) -> dict[str, Any]:

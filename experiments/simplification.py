@@ -10,11 +10,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from experiments.ideal_goals import (
     FOLDS,
@@ -26,12 +25,16 @@ from experiments.ideal_goals import (
     ideal_line,
     is_right,
 )
+from experiments.progress import progress_bar
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
+from experiments.study import default_folder
 from jaxsimp import records
 from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.simplification import METHODS, simplify_batch
 
 ROWS_FILE = "goals.jsonl"
+IDENTITY = ("kind", "name", "size", "noise", "level", "gap", "rounding", "seed", "method")
+"""Fields that tell a row from all others: those of a `Case`, and the method."""
 ROPE_LENGTH = 1.0
 ROPE_LEVELS, CLOTH_LEVELS = (0.001, 0.002, 0.004), (0.0005, 0.001, 0.002)
 """Levels of noise, metres: on a rope of 1 m and a cloth of 0.3 m."""
@@ -42,7 +45,7 @@ ROUNDINGS = (0.0, 0.004)
 
 
 @dataclass(frozen=True)
-class Study:
+class SimplificationStudy:
     """One configuration of the study.
 
     Attributes:
@@ -151,29 +154,19 @@ def available_methods() -> tuple[str, ...]:
     return tuple(name for name in METHODS if name not in missing)
 
 
-def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+def run_study(study: SimplificationStudy, folder: Path, console: Console) -> dict[str, Any]:
     """Simplify what is not in the folder yet, and return the summary of everything in it."""
-    path = folder / ROWS_FILE
-    done = {_identity(row) for row in records.read_rows(path)}
-    cases = list(study.cases())
-    left = [
-        (case, method)
-        for case in cases
+    rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
+    todo = {
+        (*asdict(case).values(), method): (case, method)
+        for case in study.cases()
         for method in study.methods
-        if (*asdict(case).values(), method) not in done
-    ]
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    }
+    left = [todo[key] for key in rows.left(todo)]
+    with progress_bar(console) as progress:
         for case, method in progress.track(left, description="goals"):
-            records.append_row(path, _row(case, case.make(), method))
-    order = {(*asdict(case).values(), m): i for i, case in enumerate(cases) for m in study.methods}
-    rows = sorted(records.read_rows(path), key=lambda row: order[_identity(row)])
-    return {"environment": records.environment(), "goals": rows}
+            rows.append(_row(case, case.make(), method))
+    return {"environment": records.environment(), "goals": rows.in_order(todo)}
 
 
 def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
@@ -194,6 +187,43 @@ def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
     }
 
 
-def _identity(row: dict[str, Any]) -> tuple[Any, ...]:
-    fields = ("kind", "name", "size", "noise", "level", "gap", "rounding", "seed", "method")
-    return tuple(row[name] for name in fields)
+@dataclass(frozen=True)
+class SimplificationOptions:
+    """How often each method finds the right key points of noisy goals.
+
+    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    """
+
+    NAME: ClassVar[str] = "simplification"
+
+    methods: tuple[str, ...] = available_methods()
+    """Methods to compare (default: all, meshlab where its extra is installed)."""
+    seeds: int = 12
+    """Draws of noise for each goal and resolution."""
+    out: Path | None = None
+    """Output folder (default: results/simplification, or results/simplification-smoke)."""
+    smoke: bool = False
+    """One resolution, one seed."""
+
+    def configuration(self) -> SimplificationStudy:
+        """The study that these options ask for.
+
+        Raises:
+            ValueError: if an option has a value that it cannot have.
+        """
+        return SimplificationStudy(
+            methods=self.methods,
+            seeds=min(self.seeds, 1) if self.smoke else self.seeds,
+            rope_sizes=(41,) if self.smoke else (41, 81),
+            cloth_sizes=(25,) if self.smoke else (25, 45, 64),
+            settled_size=13 if self.smoke else 25,
+        )
+
+    def run(self, console: Console) -> None:
+        """Run the study."""
+        study, folder = self.configuration(), self.out or default_folder(self.NAME, self.smoke)
+        records.open_folder(folder, study.identity())
+        from experiments.simplification_report import write_report
+
+        write_report(study, run_study(study, folder, console), folder)
+        console.print(f"done: {folder}/report.md")

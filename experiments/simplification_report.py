@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from experiments.markdown import provenance, save_figure, success_interval, table
-from experiments.simplification import ROWS_FILE, Case, Study
-from jaxsimp import viz
-from jaxsimp.records import write_json
+from experiments.simplification import ROWS_FILE, Case, SimplificationStudy
+from jaxsimp import records, viz
 from jaxsimp.simplification import KeyPoints, simplify_batch
 
 if TYPE_CHECKING:
@@ -26,9 +25,9 @@ SHOWN = ("M, unequal", "triangle 3 4 5", "letter", "quarter", "four corners", "t
 """Goals in the figures of models, each with noise."""
 
 
-def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
+def write_report(study: SimplificationStudy, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / "summary.json", summary)
+    records.write_json(folder / "summary.json", summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     rows = summary["goals"]
@@ -43,7 +42,7 @@ def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
     (folder / "report.md").write_text(_report(study, summary))
 
 
-def _shown(study: Study, method: str) -> dict[str, tuple[Any, KeyPoints]]:
+def _shown(study: SimplificationStudy, method: str) -> dict[str, tuple[Any, KeyPoints]]:
     """Goals with noise of one seed, and what a method makes of them."""
     shown = {}
     for case in _typical_cases(study):
@@ -53,7 +52,7 @@ def _shown(study: Study, method: str) -> dict[str, tuple[Any, KeyPoints]]:
     return shown
 
 
-def _typical_cases(study: Study) -> list[Case]:
+def _typical_cases(study: SimplificationStudy) -> list[Case]:
     """One case for each goal that is shown: the last seed of the smallest size."""
     cases = {case.name: case for case in reversed(list(study.cases())) if case.kind != "settled"}
     smallest = {study.rope_sizes[0], study.cloth_sizes[0]}
@@ -129,7 +128,7 @@ def _rate(rows: Rows) -> tuple[float, tuple[float, float]]:
     return right / len(rows), success_interval(right, len(rows))
 
 
-def _report(study: Study, summary: dict[str, Any]) -> str:
+def _report(study: SimplificationStudy, summary: dict[str, Any]) -> str:
     rows = summary["goals"]
     certified = _of(rows, kind="rope", method="robust")
     lines = [

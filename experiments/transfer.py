@@ -7,24 +7,24 @@ has exploited our dynamics; where neither does, the engines differ.
 
 import dataclasses
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import jax.numpy as jnp
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from experiments import plans
+from experiments.plan_options import PlanOptions
+from experiments.progress import progress_bar
 from experiments.scripted import SCRIPTS, scripted_plan
+from experiments.study import told_done
 from jaxsimp import records
-from jaxsimp.dynamics import Actions
-from jaxsimp.engines import MassSprings
-from jaxsimp.engines.mujoco.execution import Replay, replay
-from jaxsimp.engines.mujoco.model import VARIANTS
-from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
-from jaxsimp.tasks import Task, score
+from jaxsimp.engines import Execution, MassSprings, MuJoCo, replay
+from jaxsimp.engines.mujoco import VARIANTS
+from jaxsimp.tasks import Task, score, task_names
 
 ROWS_FILE = "replays.jsonl"
 REPLAYS_FOLDER = "replays"
@@ -35,7 +35,7 @@ SCRIPTED_SEEDS = 2
 
 
 @dataclass(frozen=True)
-class Study:
+class TransferStudy:
     """One configuration of the study.
 
     Attributes:
@@ -44,7 +44,7 @@ class Study:
         success_score: least settled score of a plan that transfers.
     """
 
-    plans: plans.Study
+    plans: plans.PlanStudy
     source: str | None
     success_score: float
 
@@ -75,10 +75,10 @@ class Case:
     @property
     def key(self) -> tuple[Any, ...]:
         """What tells it from other plans."""
-        return _key(self.row)
+        return tuple(self.row[name] for name in plans.IDENTITY)
 
 
-def planned_study(folder: Path) -> plans.Study:
+def planned_study(folder: Path) -> plans.PlanStudy:
     """The study of plans that a folder holds the results of.
 
     Raises:
@@ -86,7 +86,7 @@ def planned_study(folder: Path) -> plans.Study:
     """
     try:
         config = json.loads((folder / records.CONFIG_FILE).read_text())
-        names = [field.name for field in dataclasses.fields(plans.Study)]
+        names = [field.name for field in dataclasses.fields(plans.PlanStudy)]
         settings = {name: config[name] for name in names}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
@@ -94,10 +94,10 @@ def planned_study(folder: Path) -> plans.Study:
             f"study of plans, as results/paper"
         ) from error
     lists = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
-    return plans.Study(**{**settings, **lists})
+    return plans.PlanStudy(**{**settings, **lists})
 
 
-def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
+def run_study(study: TransferStudy, folder: Path, console: Console) -> dict[str, Any]:
     """Plan and replay what is not in the folder yet, and return the summary of everything."""
     if study.source is None:
         found, source = plans.run_study(study.plans, folder, console)["runs"], folder
@@ -107,8 +107,8 @@ def run_study(study: Study, folder: Path, console: Console) -> dict[str, Any]:
     cases = [Case(_row_of_plan(row), source / row["plan"]) for row in found]
     cases += _scripted_cases(study, folder, console)
     _replay_all(study, cases, folder, console)
-    rows = {_key(row): row for row in records.read_rows(folder / ROWS_FILE)}
-    ordered = [rows[case.key] for case in cases]
+    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
+    ordered = rows.in_order(case.key for case in cases)
     return {
         "environment": records.environment(),
         "transfer": [row for row in ordered if row["action_space"] != SCRIPTED],
@@ -122,22 +122,23 @@ def _row_of_plan(row: dict[str, Any]) -> dict[str, Any]:
     return {name: row[name] for name in names}
 
 
-def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
+def _scripted_cases(study: TransferStudy, folder: Path, console: Console) -> list[Case]:
     """Plans made by hand, carried out in our dynamics where they are not on disk yet."""
     (folder / plans.PLANS_FOLDER).mkdir(exist_ok=True)
-    cases, planners = [], {}
+    cases, executors = [], {}
     for name, seed in study.scripted():
         path = folder / plans.PLANS_FOLDER / f"{name}-{SCRIPTED}-{seed}.npz"
         task = study.plans.task(name)
         episode = task.episode_fn(seed)
         if not path.exists():
-            if name not in planners:
+            if name not in executors:
                 console.print(f"{name}: plans made by hand")
-                planners[name] = executor(task, study.plans.self_contact)
+                executors[name] = MassSprings(study.plans.self_contact).executor(task)
             actions = scripted_plan(task, episode)
-            execution = planners[name].execute(episode, actions)
-            save_plan(path, actions, execution.positions)
-        settled = load_plan(path)[1]["positions"][-1].astype(float)
+            execution = executors[name](episode, actions)
+            engine = MassSprings(study.plans.self_contact)
+            records.save_plan(path, task, episode, actions, execution, engine=engine)
+        settled = records.load_plan(path).positions[-1].astype(float)
         value = float(score(task, episode, jnp.asarray(settled)))
         row = {
             "planning": SCRIPTED,
@@ -152,47 +153,37 @@ def _scripted_cases(study: Study, folder: Path, console: Console) -> list[Case]:
     return cases
 
 
-def executor(task: Task, self_contact: bool) -> Planner:
-    """Carries out plans in our dynamics, and searches for none."""
-    judge = MassSprings(self_contact=self_contact)
-    return Planner(task, CEMConfig(1, 1, 1), Layout(), judge=judge)
-
-
-def _replay_all(study: Study, cases: list[Case], folder: Path, console: Console) -> None:
+def _replay_all(study: TransferStudy, cases: list[Case], folder: Path, console: Console) -> None:
     """Replay task by task what has no row yet."""
     (folder / REPLAYS_FOLDER).mkdir(exist_ok=True)
-    done = {_key(row) for row in records.read_rows(folder / ROWS_FILE)}
-    left = [case for case in cases if case.key not in done]
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
+    todo = set(rows.left(case.key for case in cases))
+    left = [case for case in cases if case.key in todo]
+    with progress_bar(console) as progress:
         bar = progress.add_task("replays in MuJoCo", total=len(left))
         for name in study.plans.tasks:
             task = study.plans.task(name)
             of_task = [case for case in left if case.row["task"] == name]
             for row in _replay_task(task, of_task, folder) if of_task else ():
-                records.append_row(folder / ROWS_FILE, row)
+                rows.append(row)
                 progress.advance(bar)
 
 
 def _replay_task(task: Task, cases: list[Case], folder: Path) -> Iterator[dict[str, Any]]:
     """Replay plans in every variant, save each one's motions, and return its row."""
     episodes = [task.episode_fn(case.row["seed"]) for case in cases]
-    plans = [load_plan(case.path)[0] for case in cases]
+    plans = [records.load_plan(case.path).actions for case in cases]
     # All variants at once: no core waits for the last plan of one.
     found = [replay(task, episodes, plans, name) for name in VARIANTS]
-    for case, actions, *results in zip(cases, plans, *found, strict=True):
+    for case, episode, actions, *results in zip(cases, episodes, plans, *found, strict=True):
         replays = dict(zip(VARIANTS, results, strict=True))
         for name, result in replays.items():
-            _save(folder, case, name, actions, result)
+            path = replay_path(folder, case.row, name)
+            records.save_plan(path, task, episode, actions, result, engine=MuJoCo(name))
         yield case.row | _fields(replays)
 
 
-def _fields(replays: dict[str, Replay]) -> dict[str, Any]:
+def _fields(replays: dict[str, Execution]) -> dict[str, Any]:
     """What replays add to a row."""
     warnings = [f"{name}: {each}" for name, one in replays.items() for each in one.warnings]
     scores = {f"mujoco_{name}_score": plans.finite(one.score) for name, one in replays.items()}
@@ -200,14 +191,70 @@ def _fields(replays: dict[str, Replay]) -> dict[str, Any]:
     return scores | status | {"warnings": warnings}
 
 
-def _save(folder: Path, case: Case, variant: str, actions: Actions, result: Replay) -> None:
-    save_plan(replay_path(folder, case.row, variant), actions, result.positions)
-
-
 def replay_path(folder: Path, row: dict[str, Any], variant: str) -> Path:
     """Where the motion of a replay is."""
     return folder / REPLAYS_FOLDER / f"{Path(row['plan']).stem}-{variant}.npz"
 
 
-def _key(row: dict[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in ("task", "action_space", "pick_encoding", "seed"))
+@dataclass(frozen=True)
+class TransferOptions(PlanOptions):
+    """Plans found in our dynamics, carried out in MuJoCo, with self-collision and without.
+
+    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    """
+
+    NAME: ClassVar[str] = "transfer"
+    TRANSFER_SCORE: ClassVar[float] = 0.8
+
+    tasks: tuple[str, ...] = task_names("paper")
+    """Tasks to plan for."""
+    action_spaces: tuple[str, ...] = ("key_points",)
+    """Particles that may be grasped."""
+    pick_encodings: tuple[str, ...] = ("categorical",)
+    """How CEM encodes what is grasped."""
+    planning: Literal["nominal", "robust", "self_contact", "mixed"] = "mixed"
+    """What the search judges plans in: the body's physics alone, an ensemble of them, the body
+    touching itself, or the last for cloths and the first for ropes."""
+    plans: Path | None = None
+    """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
+
+    def transfer(self) -> TransferStudy:
+        """The study that these options ask for.
+
+        Raises:
+            ValueError: if an option has a value that it cannot have.
+        """
+        if self.plans and self.planning != TransferOptions.planning:
+            raise ValueError(
+                f"--planning {self.planning} finds plans, and those of {self.plans} are found; "
+                f"leave one of them out"
+            )
+        planned = planned_study(self.plans) if self.plans else self.configuration()
+        source = str(self.plans) if self.plans else None
+        return TransferStudy(planned, source, self.TRANSFER_SCORE)
+
+    def run(self, console: Console) -> None:
+        """Run the study, or list what it can be asked for."""
+        if self.list:
+            super().run(console)
+            return
+        study, folder = self.transfer(), self.folder()
+        records.open_folder(folder, study.identity())
+        from experiments.transfer_report import write_report
+
+        start = time.perf_counter()
+        summary = run_study(study, folder, console)
+        write_report(study, summary, folder)
+        if self.plans:
+            _add_to_report(study, summary, self.plans)
+        told_done(console, folder, start)
+
+
+def _add_to_report(study: TransferStudy, summary: dict[str, Any], source: Path) -> None:
+    """Add columns of how plans transfer to the report of the study that they are from."""
+    from experiments import plan_report
+
+    records.write_json(source / plan_report.TRANSFER_FILE, summary["transfer"])
+    path = source / plan_report.SUMMARY_FILE
+    if path.exists():
+        plan_report.write_report(study.plans, json.loads(path.read_text()), source)

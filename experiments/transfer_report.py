@@ -7,11 +7,9 @@ import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER
-from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, Study, replay_path
-from jaxsimp import viz
-from jaxsimp.engines.mujoco.model import VARIANTS
-from jaxsimp.planning import load_plan
-from jaxsimp.records import write_json
+from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, TransferStudy, replay_path
+from jaxsimp import records, viz
+from jaxsimp.engines.mujoco import VARIANTS
 
 Rows = list[dict[str, Any]]
 ENGINES = {
@@ -23,9 +21,9 @@ ENGINES = {
 LABELS = {"key_points": "key points", "all_particles": "all particles", SCRIPTED: "made by hand"}
 
 
-def write_report(study: Study, summary: dict[str, Any], folder: Path) -> None:
+def write_report(study: TransferStudy, summary: dict[str, Any], folder: Path) -> None:
     """Write `summary.json`, the figures and `report.md`."""
-    write_json(folder / "summary.json", summary)
+    records.write_json(folder / "summary.json", summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
     rows = [*summary["transfer"], *summary["scripted"]]
@@ -67,7 +65,7 @@ def _shown(rows: Rows) -> dict[str, dict[str, Any]]:
     return shown | ({"by_hand": scripted[0]} if scripted else {})
 
 
-def _picture(study: Study, folder: Path, row: dict[str, Any], name: str) -> str:
+def _picture(study: TransferStudy, folder: Path, row: dict[str, Any], name: str) -> str:
     """Draw a plan in all engines, a row each; the file's name."""
     task = study.plans.task(row["task"])
     source = (
@@ -75,7 +73,7 @@ def _picture(study: Study, folder: Path, row: dict[str, Any], name: str) -> str:
     )
     paths = [source / row["plan"], *(replay_path(folder, row, variant) for variant in VARIANTS)]
     motions = {
-        engine: (load_plan(path)[1]["positions"], _score(row, column))
+        engine: (records.load_plan(path).positions, _score(row, column))
         for (engine, column), path in zip(ENGINES.items(), paths, strict=True)
     }
     goal = np.asarray(task.episode_fn(row["seed"]).goal)
@@ -89,7 +87,7 @@ def _score(row: dict[str, Any], column: str) -> float:
     return -np.inf if row[column] is None else row[column]
 
 
-def _report(study: Study, summary: dict[str, Any], pictures: list[str]) -> str:
+def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) -> str:
     lines = [
         "# Transfer: plans found in our dynamics, carried out in MuJoCo",
         "",

@@ -3,7 +3,259 @@
 A goal (where every particle should end) is reduced to a few key points; they mask the action
 tensor; a planner searches actions by rolling a population through differentiable dynamics.
 
+    import jaxsimp as js
+
+`js` offers the names below and the rooms they are from (`js.goals`, `js.viz`, ...). A name is
+loaded when it is first used, so that `import jaxsimp` itself imports no other library.
+
 Words and axes, everywhere: `N` particles, `K` key points, `T` actions in a plan, `G` pickers,
 `B` population, `S` springs, `F` triangles; the last axis of length 3 is x, y, z with z up.
 Units are SI. `key` is a JAX PRNG key, `num_*` a count, `*_fn` a callable.
 """
+
+from typing import TYPE_CHECKING
+
+# A name of the face stands in three places: here for people and type checkers, in `__all__`, and
+# in the table of rooms at the end. tests/test_face.py compares them.
+if TYPE_CHECKING:
+    from jaxsimp import (
+        bodies,
+        calibration,
+        dynamics,
+        engines,
+        goals,
+        planning,
+        records,
+        simplification,
+        tasks,
+        viz,
+    )
+    from jaxsimp.bodies import (
+        Body,
+        Garment,
+        Material,
+        cloth,
+        from_mesh,
+        load_mesh,
+        rope,
+        rope_along,
+        skirt,
+        t_shirt,
+        towel,
+        trousers,
+    )
+    from jaxsimp.calibration import (
+        Calibration,
+        CalibrationConfig,
+        Recording,
+        calibrate,
+        recording_error,
+        simulate_recordings,
+    )
+    from jaxsimp.dynamics import (
+        NONE,
+        Actions,
+        Pickers,
+        Simulation,
+        State,
+        at_rest,
+        largest_time_step,
+        make_pickers,
+        make_simulation,
+        rollout,
+        settle,
+    )
+    from jaxsimp.engines import (
+        MJX,
+        Engine,
+        Ensemble,
+        Execution,
+        ExecutionStatus,
+        Layout,
+        MassSprings,
+        MuJoCo,
+        SearchEngine,
+        Spread,
+        compare_with_mjx,
+        make_ensemble,
+        replay,
+    )
+    from jaxsimp.engines.mujoco import make_model, save_mjcf
+    from jaxsimp.planning import (
+        CEM,
+        ENCODINGS,
+        ActionSpace,
+        Algorithm,
+        Categorical,
+        Descent,
+        Encoding,
+        GaussianIndex,
+        Joint,
+        Optimum,
+        Plan,
+        Planner,
+        Plans,
+        RandomShooting,
+        Reranking,
+        Sequence,
+        make_problem,
+        optimize,
+        search_on_host,
+    )
+    from jaxsimp.records import SavedPlan, load_plan, save_plan
+    from jaxsimp.simplification import (
+        METHODS,
+        FitStatus,
+        KeyPoints,
+        Workspace,
+        simplify,
+        simplify_batch,
+    )
+    from jaxsimp.tasks import Episode, Task, make_task, register, score, task_names
+
+    __version__: str
+
+__all__ = [
+    "CEM",
+    "ENCODINGS",
+    "METHODS",
+    "MJX",
+    "NONE",
+    "ActionSpace",
+    "Actions",
+    "Algorithm",
+    "Body",
+    "Calibration",
+    "CalibrationConfig",
+    "Categorical",
+    "Descent",
+    "Encoding",
+    "Engine",
+    "Ensemble",
+    "Episode",
+    "Execution",
+    "ExecutionStatus",
+    "FitStatus",
+    "Garment",
+    "GaussianIndex",
+    "Joint",
+    "KeyPoints",
+    "Layout",
+    "MassSprings",
+    "Material",
+    "MuJoCo",
+    "Optimum",
+    "Pickers",
+    "Plan",
+    "Planner",
+    "Plans",
+    "RandomShooting",
+    "Recording",
+    "Reranking",
+    "SavedPlan",
+    "SearchEngine",
+    "Sequence",
+    "Simulation",
+    "Spread",
+    "State",
+    "Task",
+    "Workspace",
+    "__version__",
+    "at_rest",
+    "bodies",
+    "calibrate",
+    "calibration",
+    "cloth",
+    "compare_with_mjx",
+    "dynamics",
+    "engines",
+    "from_mesh",
+    "goals",
+    "largest_time_step",
+    "load_mesh",
+    "load_plan",
+    "make_ensemble",
+    "make_model",
+    "make_pickers",
+    "make_problem",
+    "make_simulation",
+    "make_task",
+    "optimize",
+    "planning",
+    "recording_error",
+    "records",
+    "register",
+    "replay",
+    "rollout",
+    "rope",
+    "rope_along",
+    "save_mjcf",
+    "save_plan",
+    "score",
+    "search_on_host",
+    "settle",
+    "simplification",
+    "simplify",
+    "simplify_batch",
+    "simulate_recordings",
+    "skirt",
+    "t_shirt",
+    "task_names",
+    "tasks",
+    "towel",
+    "trousers",
+    "viz",
+]
+
+_ROOMS = {
+    "bodies": "Body Garment Material cloth from_mesh load_mesh rope rope_along skirt t_shirt "
+    "towel trousers",
+    "calibration": "Calibration CalibrationConfig Recording calibrate recording_error "
+    "simulate_recordings",
+    "dynamics": "NONE Actions Pickers Simulation State at_rest largest_time_step make_pickers "
+    "make_simulation rollout settle",
+    "engines": "Engine Ensemble Execution ExecutionStatus Layout MassSprings MJX MuJoCo "
+    "SearchEngine Spread compare_with_mjx make_ensemble replay",
+    "engines.mujoco": "make_model save_mjcf",
+    "goals": "",
+    "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical Descent Encoding GaussianIndex "
+    "Joint Optimum Plan Planner Plans RandomShooting Reranking Sequence make_problem "
+    "optimize search_on_host",
+    "records": "SavedPlan load_plan save_plan",
+    "simplification": "METHODS FitStatus KeyPoints Workspace simplify simplify_batch",
+    "tasks": "Episode Task make_task register score task_names",
+    "viz": "",
+}
+"""What the face offers: of each room the names that users need without naming the room."""
+
+if not TYPE_CHECKING:  # a type checker that saw this function would accept every name
+    _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names.split()}
+
+    def __getattr__(name: str) -> object:
+        """Load a name of the face when it is first used (PEP 562)."""
+        from importlib import import_module
+
+        if name in _ROOM_OF:
+            value = getattr(import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
+        elif name in _ROOMS:
+            value = import_module(f"{__name__}.{name}")
+        elif name == "__version__":
+            value = _version()
+        else:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        globals()[name] = value  # the next use does not come here
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+def _version() -> str:
+    """The version in the package's metadata; "0+unknown" for files that are not installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("jaxsimp")
+    except metadata.PackageNotFoundError:
+        return "0+unknown"

@@ -16,13 +16,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxsimp.bodies import Body
+from jaxsimp.bodies.material import PARAMETERS
 from jaxsimp.dynamics.pickers import Actions, Pickers, make_pickers
-from jaxsimp.dynamics.rollout import rollout
+from jaxsimp.dynamics.rollouts import rollout
 from jaxsimp.dynamics.simulation import Simulation, State, largest_time_step, make_simulation
 from jaxsimp.dynamics.springs import make_springs
 
-PARAMETERS = ("stiffness", "damping", "drag", "friction")
-"""What can be fitted."""
 LONGEST_TIME_STEP = 2e-3
 """Of replays, seconds."""
 MOST_KINDS = 4
@@ -289,15 +288,9 @@ def _scaled(simulation: Simulation, table: Int[Array, "D HN"], factors: Factors)
 
 
 def _scaled_body(body: Body, factors: dict[str, np.ndarray], kinds: Int[np.ndarray, " S"]) -> Body:
-    factors = {name: np.ones(()) for name in PARAMETERS} | factors
-    stiffness = np.broadcast_to(factors["stiffness"], kinds.max(initial=0) + 1)
-    return replace(
-        body,
-        stiffness=body.stiffness * stiffness[kinds],
-        damping=body.damping * factors["damping"],
-        drag=body.drag * float(factors["drag"]),
-        friction=body.friction * float(factors["friction"]),
-    )
+    others = {name: float(factors[name]) for name in factors if name != "stiffness"}
+    stiffness = np.broadcast_to(factors.get("stiffness", 1.0), kinds.max(initial=0) + 1)
+    return body.scaled(stiffness=stiffness[kinds], **others)
 
 
 def _kind_table(body: Body, kinds: Int[np.ndarray, " S"]) -> Int[Array, "D HN"]:
@@ -376,7 +369,8 @@ def _check_seconds(name: str, seconds: float) -> None:
 
 
 def _check_fitted(body: Body, config: CalibrationConfig) -> None:
-    zero = [name for name in config.parameters if not np.any(getattr(body, name))]
+    values = vars(body.material) | {"stiffness": body.stiffness, "damping": body.damping}
+    zero = [name for name in config.parameters if not np.any(values[name])]
     if zero:
         raise ValueError(
             f"{zero[0]} of the body is 0, and no factor changes that; start from a number "

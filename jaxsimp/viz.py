@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body
-from jaxsimp.bodies.meshes import boundary_edges
+from jaxsimp.bodies.topology import boundary_edges
 from jaxsimp.simplification import FitStatus, KeyPoints
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> N
         )
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-        outline = positions[boundary_edges(body.faces)]
+        outline = positions[boundary_edges(body.faces)[0]]
         if len(outline):  # a closed surface has none
             axes.add_collection3d(Line3DCollection(outline, colors="black", linewidths=0.6))
     else:
@@ -224,6 +224,10 @@ def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -
 
 def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
     """A model's error by number of key points, with the tolerance and the number chosen."""
+    if not model.sizes:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "infeasible: no model is within the workspace", ha="center")
+        return
     chosen = "chosen" if model.status == FitStatus.FITS else "none fits, last tried"
     axes.plot(model.sizes, np.array(model.errors) * 1e3, "o-", color=COLORS[0])
     axes.axhline(model.tolerance * 1e3, color=GOAL_COLOR, ls="--", label="tolerance")

@@ -36,6 +36,7 @@ import numpy as np
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth, rope
+from jaxsimp.bodies.topology import are_among, chain, half_edges
 from jaxsimp.calibration import (
     CalibrationConfig,
     Recording,
@@ -60,7 +61,7 @@ longest = 1e-3  # time step of replays, seconds
 
 # %%
 @dataclass(frozen=True)
-class Material:
+class Flex:
     """What the other engine knows of a flex, and we do not.
 
     Attributes:
@@ -72,12 +73,11 @@ class Material:
     drag: float
 
 
-def flex_model(body: Body, material: Material) -> mujoco.MjModel:
+def flex_model(body: Body, flex: Flex) -> mujoco.MjModel:
     """A body as a flex of MuJoCo."""
     dim, elements = 2, body.faces
     if not len(elements):
-        dim, ids = 1, np.arange(body.num_particles)
-        elements = np.stack([ids[:-1], ids[1:]], axis=1)
+        dim, elements = 1, chain(body.num_particles)
     points = " ".join(f"{value:.9g}" for value in body.rest.ravel())
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco>
@@ -86,18 +86,18 @@ def flex_model(body: Body, material: Material) -> mujoco.MjModel:
             <flexcomp name="body" type="direct" dim="{dim}" mass="{body.mass.sum()}"
                 radius="{body.radius}" point="{points}"
                 element="{" ".join(map(str, elements.ravel()))}">
-              {material.settings}
+              {flex.settings}
               <contact selfcollide="none" contype="0" conaffinity="0"/>
             </flexcomp>
           </worldbody>
         </mujoco>""")
-    model.dof_damping[:] = material.drag * model.body_mass[model.dof_bodyid]
+    model.dof_damping[:] = flex.drag * model.body_mass[model.dof_bodyid]
     return model
 
 
-def record(body: Body, material: Material, picked: list[int], moves: np.ndarray) -> Recording:
+def record(body: Body, flex: Flex, picked: list[int], moves: np.ndarray) -> Recording:
     """The flex swings while pickers carry particles along displacements, shape (T, G, 3)."""
-    model = flex_model(body, material)
+    model = flex_model(body, flex)
     data = mujoco.MjData(model)
     start = goals.flat(body) + np.array([0.0, 0.0, 1.0])
     position, velocity = data.qpos.reshape(-1, 3), data.qvel.reshape(-1, 3)  # views
@@ -119,12 +119,12 @@ def record(body: Body, material: Material, picked: list[int], moves: np.ndarray)
     return Recording(at_rest(start), actions, np.array(seen))
 
 
-def motions(body, material, picked, seed, num_actions=num_actions) -> list[Recording]:
+def motions(body, flex, picked, seed, num_actions=num_actions) -> list[Recording]:
     """Recordings of random moves, one for each choice of picked particles."""
     rng = np.random.default_rng(seed)
     reach = 0.12 * body.size
     return [
-        record(body, material, each, rng.uniform(-reach, reach, (num_actions, len(each), 3)))
+        record(body, flex, each, rng.uniform(-reach, reach, (num_actions, len(each), 3)))
         for each in picked
     ]
 
@@ -145,8 +145,7 @@ def motions(body, material, picked, seed, num_actions=num_actions) -> list[Recor
 def kinds_of_springs(body):
     """Springs by stiffness, counted from the softest, and last those on diagonals of triangles."""
     values, kinds = np.unique(body.stiffness, return_inverse=True)
-    edges = {frozenset(face[:k] + face[k + 1 :]) for face in body.faces.tolist() for k in range(3)}
-    is_edge = np.array([frozenset(spring) in edges for spring in body.springs.tolist()])
+    is_edge = are_among(body.springs, half_edges(body.faces)[0])
     is_longest = np.isclose(body.rest_length, np.sqrt(2) * body.rest_length.min())
     return np.where(is_edge & is_longest, len(values), kinds)
 
@@ -159,13 +158,13 @@ last = rope_body.num_particles - 1
 cases = {
     "rope": (
         rope_body,
-        Material('<edge stiffness="40" damping="0.02"/>', drag=2.0),
+        Flex('<edge stiffness="40" damping="0.02"/>', drag=2.0),
         [[0]],
         [[last], [last // 2]],
     ),
     "cloth": (
         cloth_body,
-        Material(
+        Flex(
             '<elasticity young="3000" poisson="0.3" thickness="0.002" damping="0.001" '
             'elastic2d="both"/>',
             drag=3.0,
@@ -193,10 +192,10 @@ def replay_errors(name, recordings):
     ]
 
 
-for name, (body, material, picked, others) in cases.items():
-    unseen[name] = motions(body, material, others, seed=1)
+for name, (body, flex, picked, others) in cases.items():
+    unseen[name] = motions(body, flex, others, seed=1)
     began = time.perf_counter()
-    seen = motions(body, material, picked, seed=0)
+    seen = motions(body, flex, picked, seed=0)
     found[name] = calibrate(body, seen, action_seconds, config, kinds=kinds_of_springs(body))
     seconds = time.perf_counter() - began
     errors[name] = replay_errors(name, unseen[name])
@@ -218,7 +217,7 @@ for name, (body, material, picked, others) in cases.items():
 # once more with other random moves, for one seed says little.
 
 # %%
-body, material, _, others = cases["cloth"]
+body, flex, _, others = cases["cloth"]
 
 
 def positions(recordings):
@@ -231,7 +230,7 @@ def rms(missed):
     return 1e3 * np.sqrt((missed**2).sum(axis=-1).reshape(len(missed) // 2, -1).mean(axis=1))
 
 
-def kinds_of_motion(body, material):
+def kinds_of_motion(body, flex):
     """By kind, recordings that were not seen: two of each seed."""
     corners = [[a, d], [b, c]]
     kinds = {
@@ -243,13 +242,13 @@ def kinds_of_motion(body, material):
         name: [
             recording
             for seed in seeds[: 1 if SMALL else None]
-            for recording in motions(body, material, picked, seed, count)
+            for recording in motions(body, flex, picked, seed, count)
         ]
         for name, (picked, seeds, count) in kinds.items()
     }
 
 
-harder, reduced = kinds_of_motion(body, material), {}
+harder, reduced = kinds_of_motion(body, flex), {}
 for name, recordings in harder.items():
     before, after = (
         rms(
@@ -283,9 +282,9 @@ if not SMALL:
 
 flip = np.arange(side**2).reshape(side, side)[:, ::-1].ravel()
 changes = {
-    "cut along the other diagonal": (replace(body, faces=flip[body.faces][:, ::-1]), material),
-    "without bending": (body, Material(material.settings.replace("both", "stretch"), 3.0)),
-    "2 % stiffer": (body, Material(material.settings.replace("3000", "3060"), 3.0)),
+    "cut along the other diagonal": (replace(body, faces=flip[body.faces][:, ::-1]), flex),
+    "without bending": (body, Flex(flex.settings.replace("both", "stretch"), 3.0)),
+    "2 % stiffer": (body, Flex(flex.settings.replace("3000", "3060"), 3.0)),
 }
 for label, (changed, other) in changes.items():
     print(f"MuJoCo's sheet {label}, from itself:")

@@ -97,8 +97,8 @@ def test_known_physics_is_recovered():
     # Replays err by order dt / 2 of a motion whose fastest modes take 20 dt: some per cent.
     for name in ("stiffness", "damping"):
         np.testing.assert_allclose(getattr(found, name), getattr(TRUE_ROPE, name), rtol=0.05)
-    assert found.drag == pytest.approx(TRUE_ROPE.drag, rel=0.05)
-    assert found.friction == pytest.approx(TRUE_ROPE.friction, rel=0.05)
+    assert found.material.drag == pytest.approx(TRUE_ROPE.material.drag, rel=0.05)
+    assert found.material.friction == pytest.approx(TRUE_ROPE.material.friction, rel=0.05)
 
 
 @pytest.mark.slow
@@ -277,7 +277,7 @@ def test_durations_that_are_none_are_refused(seconds):
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="drag of the body is 0"):
-        calibrate(replace(ROPE, drag=0.0), [good()], SECONDS)
+        calibrate(ROPE.scaled(drag=0.0), [good()], SECONDS)
     for kinds in (np.zeros(3, dtype=int), np.full(9, -1)):
         with pytest.raises(ValueError, match="from 0 for each of 9 springs"):
             calibrate(ROPE, [good()], SECONDS, kinds=kinds)

@@ -3,17 +3,19 @@
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from experiments.benchmark import contact, planning, rollouts
 from experiments.benchmark.measure import FULL, QUICK, Row, Scale
+from experiments.progress import progress_bar
 from jaxsimp import records
+from jaxsimp.cli.status import exit_status
 
 SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
     "step": rollouts.step,
@@ -28,8 +30,6 @@ SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
     "scaling": rollouts.scaling,
     "self_contact": contact.self_contact,
 }
-INTERRUPTED = 130
-"""Exit status of a program that Ctrl-C ended, as shells have it."""
 
 
 @dataclass(frozen=True)
@@ -68,16 +68,13 @@ class Options:
 def main() -> int:
     """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
     options = tyro.cli(Options, prog="python -m experiments.benchmark")
+    return exit_status(partial(_run, options), "interrupted; sections that are finished are kept")
+
+
+def _run(options: Options) -> int:
+    options.check()
     console = Console(width=None if sys.stdout.isatty() else 160)  # a file has no width
-    try:
-        options.check()
-        run(options, QUICK if options.quick else FULL, console)
-    except ValueError as error:
-        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
-        return 2
-    except KeyboardInterrupt:
-        console.print("\ninterrupted; sections that are finished are kept")
-        return INTERRUPTED
+    run(options, QUICK if options.quick else FULL, console)
     return 0
 
 
@@ -86,13 +83,7 @@ def run(options: Options, scale: Scale, console: Console) -> list[Row]:
     names = [name for name in SECTIONS if name in options.only or not options.only]
     environment = records.environment()
     rows: list[Row] = []
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    with progress_bar(console, remaining=False) as progress:
         bar = progress.add_task("", total=len(names))
         for name in names:
             progress.update(bar, description=name)

@@ -20,9 +20,16 @@ from experiments.benchmark.measure import (
 )
 from jaxsimp import goals
 from jaxsimp.bodies import cloth
-from jaxsimp.dynamics import NONE, Actions, at_rest, largest_time_step, make_pickers, rollout
-from jaxsimp.dynamics.simulation import make_simulation
-from jaxsimp.planning import Layout, PopulationMap
+from jaxsimp.dynamics import (
+    NONE,
+    Actions,
+    at_rest,
+    largest_time_step,
+    make_pickers,
+    make_simulation,
+    rollout,
+)
+from jaxsimp.engines import Layout, PopulationMap
 
 ACTION_SECONDS = 0.25
 

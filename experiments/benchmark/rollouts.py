@@ -29,8 +29,8 @@ from experiments.benchmark.peers.workload import (
     make_workload,
 )
 from jaxsimp.dynamics import Actions, at_rest, settle
+from jaxsimp.engines import Layout, PopulationMap, default_layout, spring_chunk_size
 from jaxsimp.machine import num_cores
-from jaxsimp.planning import Layout, PopulationMap, default_layout
 
 SWEPT_POPULATION, SWEPT_HORIZON = 64, 2
 """Where the sweeps of `scaling` meet: such that all of them are done in minutes."""
@@ -112,7 +112,7 @@ def _layouts(kind: str, side: int, scale: Scale) -> Iterator[Row]:
         make_body(kind, side), scale.population, scale.num_actions, scale.action_steps
     )
     total = workload.population
-    layouts = [default_layout(total, physics(workload)[0]), Layout(total, 1)]
+    layouts = [_layout(workload, total), Layout(total, 1)]
     for workers in sorted({1, num_cores()}):
         chunks = (chunk for chunk in scale.chunk_sizes if chunk <= total // workers)
         layouts.extend(Layout(chunk, workers) for chunk in chunks)
@@ -131,6 +131,11 @@ def _layouts(kind: str, side: int, scale: Scale) -> Iterator[Row]:
             checked_against="default layout",
             error=float(np.abs(each.result - ready[0].result).max()),
         ) | measured(each, seconds, workload.particle_steps)
+
+
+def _layout(workload: Workload, population: int) -> Layout:
+    """The layout measured to be best."""
+    return default_layout(population, spring_chunk_size(physics(workload)[0]))
 
 
 def describe(layout: Layout) -> str:
@@ -259,7 +264,9 @@ def scaling(scale: Scale) -> Iterator[Row]:
                 engine="jaxsimp",
                 body=f"cloth_{point[0]}",
                 population=point[1],
-                layout=describe(default_layout(point[1], physics(workloads[point])[0])),
+                layout=describe(
+                    default_layout(point[1], spring_chunk_size(physics(workloads[point])[0]))
+                ),
                 horizon=point[2],
                 particle_steps=workloads[point].particle_steps,
             )

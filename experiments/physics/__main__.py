@@ -3,13 +3,14 @@
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
-from rich.console import Console
 
 from experiments.physics import against_mujoco, resolution, self_contact, swings
+from jaxsimp.cli.status import exit_status
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,13 +50,13 @@ class Options:
 
 
 def main() -> int:
-    """Run the command line; the exit status is 0, or 2 for a wrong request."""
+    """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
     options = tyro.cli(Options, prog="python -m experiments.physics", description=Options.__doc__)
-    try:
-        options.check()
-    except ValueError as error:
-        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False)
-        return 2
+    return exit_status(partial(_run, options))
+
+
+def _run(options: Options) -> int:
+    options.check()
     save_figures(options)
     return 0
 

@@ -1,7 +1,7 @@
 """The same cloth in ours and as a flex of MuJoCo: hanging at rest, and folded by the same plan."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
@@ -10,12 +10,11 @@ from jaxtyping import Float, Int
 
 from experiments.physics.measure import Positions, hang, rms, upright
 from experiments.scripted import scripted_plan
-from experiments.transfer import executor
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions
-from jaxsimp.engines.mujoco.execution import replay
-from jaxsimp.engines.mujoco.model import make_model
+from jaxsimp.engines import MassSprings, replay
+from jaxsimp.engines.mujoco import make_model
 from jaxsimp.tasks import Episode, Task, make_task, score
 from jaxsimp.viz import COLORS
 
@@ -90,12 +89,12 @@ def ways_to_hang(body: Body) -> dict[str, Hanging]:
 
 def stiffened(body: Body, factor: float) -> Body:
     """A body whose springs are stiffer, and damped in the same proportion to critical."""
-    return replace(body, stiffness=factor * body.stiffness, damping=np.sqrt(factor) * body.damping)
+    return body.scaled(stiffness=factor, damping=float(np.sqrt(factor)))
 
 
 def hung(body: Body, seconds: float) -> dict[str, dict[str, Positions]]:
     """Positions by the way it hangs, and by the engine; in air that slows it five times as much."""
-    slowed = replace(body, drag=5 * body.drag)
+    slowed = body.scaled(drag=5.0)
     return {
         name: {
             OURS: hang(slowed, way.start, way.held, seconds),
@@ -150,7 +149,7 @@ def folds(name: str, resolution: int, seed: int = 0) -> dict[str, Fold]:
 
 def carry_out(task: Task, episode: Episode, plan: Actions, *, self_contact: bool) -> Positions:
     """Where a plan leaves a body in our dynamics once it has settled, metres."""
-    done = executor(task, self_contact).execute(episode, plan)
+    done = MassSprings(self_contact).executor(task)(episode, plan)
     return done.positions[-1].astype(float)
 
 

@@ -1,13 +1,17 @@
 """Bodies: ropes, cloths, garments and triangle meshes as particles and springs, in SI units."""
 
-from jaxsimp.bodies.body import Body, cloth, from_mesh, rope, rope_along
+from jaxsimp.bodies.body import Body
+from jaxsimp.bodies.constructors import cloth, from_mesh, rope, rope_along
 from jaxsimp.bodies.garments import Garment, skirt, t_shirt, towel, trousers
+from jaxsimp.bodies.material import MATERIALS, Material
 from jaxsimp.bodies.meshes import clean_mesh, load_mesh, read_mesh
 from jaxsimp.bodies.outlines import mesh_outline, mesh_symmetric_outline, remesh
 
 __all__ = [
+    "MATERIALS",
     "Body",
     "Garment",
+    "Material",
     "clean_mesh",
     "cloth",
     "from_mesh",

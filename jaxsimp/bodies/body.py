@@ -1,24 +1,36 @@
 """Bodies: what is simulated, simplified and planned for.
 
-A body is a mass-spring system: particles with masses, springs between pairs of
-particles, and (for surfaces) triangles. A rope and a cloth differ only in how these
-arrays are filled, so everything downstream knows one kind of body.
+A body is a mass-spring system: particles with masses, springs between pairs of particles, and (for
+surfaces) triangles, of one material. A rope and a cloth differ only in how these arrays are
+filled, so everything downstream knows one kind of body; `jaxsimp.bodies.constructors` makes them.
 
-All arrays are NumPy on the host and read-only; `jaxsimp.dynamics` turns a body into the
-arrays of a simulation.
+All arrays are NumPy on the host and read-only; `jaxsimp.dynamics` turns a body into the arrays of
+a simulation.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.meshes import clean_mesh, face_areas, spring_weights
+from jaxsimp.bodies.checks import (
+    require_at_least_zero,
+    require_count,
+    require_finite,
+    require_positive,
+)
+from jaxsimp.bodies.material import FACTORS, FAMILIES, Material, refuse_unknown
+from jaxsimp.bodies.topology import distinct_edges
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
     """A mass-spring system of `N` particles, `S` springs and `F` triangles.
+
+    A simulation takes masses, stiffness and damping from the arrays, and all other parameters from
+    the material. The constructors fill the arrays from the material; springs may differ from it
+    one by one. Arrays are copied, and read-only, also after unpickling.
 
     Attributes:
         name: the kind of body, for messages and reports.
@@ -26,14 +38,13 @@ class Body:
             z = 0, centred along x and y. Flat, but for a mesh that is not.
         mass: particle masses, shape (N,), kilograms.
         springs: particle ids of the spring ends, shape (S, 2), no pair twice.
+        families: of each spring, the index of its family in `FAMILIES`, shape (S,): 0 for
+            stretch, 1 for shear, 2 for bend.
         rest_length: spring lengths at zero force, shape (S,), metres.
         stiffness: spring stiffness, shape (S,), newtons per metre.
-        damping: force per rate of elongation of the spring, shape (S,), newton-seconds
-            per metre.
+        damping: force per rate of elongation of the spring, shape (S,), newton-seconds per metre.
         faces: particle ids of the triangles, shape (F, 3); F = 0 for a rope.
-        radius: half the thickness, metres: a particle rests on the table at this height.
-        drag: rate at which the air slows every particle, per second: dv/dt = -drag v.
-        friction: Coulomb coefficient between the body and the table.
+        material: the physical parameters.
         shape: number of particles along each axis of a grid, `(rows, columns)` for a cloth;
             `(N,)` for a body that is none, as a rope or a mesh.
 
@@ -46,23 +57,31 @@ class Body:
     rest: Float[np.ndarray, "N 3"]
     mass: Float[np.ndarray, " N"]
     springs: Int[np.ndarray, "S 2"]
+    families: Int[np.ndarray, " S"]
     rest_length: Float[np.ndarray, " S"]
     stiffness: Float[np.ndarray, " S"]
     damping: Float[np.ndarray, " S"]
     faces: Int[np.ndarray, "F 3"]
-    radius: float
-    drag: float
-    friction: float
+    material: Material
     shape: tuple[int, ...]
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                own = value.copy(order="K")
+                own.flags.writeable = False
+                object.__setattr__(self, field.name, own)
         _check_arrays(self)
-        for name in ("rest", "mass", "springs", "rest_length", "stiffness", "damping", "faces"):
-            getattr(self, name).flags.writeable = False
-        for name in ("stiffness", "damping", "radius", "drag", "friction"):
-            _require_at_least_zero(name, getattr(self, name))
-        _require_positive("mass", self.mass)
-        _require_positive("rest_length", self.rest_length)
+        _check_ids(self)
+        for name in ("stiffness", "damping"):
+            require_at_least_zero(name, getattr(self, name))
+        for name in ("mass", "rest_length"):
+            require_positive(name, getattr(self, name))
+
+    def __reduce__(self) -> tuple[type["Body"], tuple[Any, ...]]:
+        """Copies are made by the constructor: pickled arrays lose their read-only flag."""
+        return type(self), tuple(getattr(self, field.name) for field in fields(self))
 
     @property
     def num_particles(self) -> int:
@@ -79,283 +98,50 @@ class Body:
         """Length of the shortest spring, metres."""
         return float(self.rest_length.min())
 
+    @property
+    def radius(self) -> float:
+        """Half the thickness, metres: a particle rests on the table at this height."""
+        return self.material.thickness / 2
 
-def rope(
-    num_particles: int = 41,
-    length: float = 0.5,
-    *,
-    mass: float = 0.02,
-    stretch_stiffness: float = 150.0,
-    bend_stiffness: float = 3.0,
-    damping: float = 0.02,
-    drag: float = 1.0,
-    friction: float = 0.5,
-    radius: float = 0.004,
-) -> Body:
-    """A rope: particles in a line along x, as in SoftGym.
+    def scaled(
+        self, *, stiffness: float | Float[np.ndarray, " S"] = 1.0, **factors: float
+    ) -> "Body":
+        """The body with its parameters times factors: arrays and material alike.
 
-    Args:
-        num_particles: number of particles, at least 2.
-        length: rest length, metres.
-        mass: of the whole rope, kilograms.
-        stretch_stiffness: of a spring between neighbours, newtons per metre.
-        bend_stiffness: of a spring between particles two apart, newtons per metre.
-        damping: of every spring, newton-seconds per metre.
-        drag: air drag, per second.
-        friction: Coulomb coefficient with the table.
-        radius: of the rope, metres.
+        Args:
+            stiffness: on the stiffness of all springs, or of each one, shape (S,). The material's
+                stiffness of a family then has the median factor of its springs, or of all
+                springs if the family has none.
+            factors: by a name in `FACTORS`.
 
-    Raises:
-        ValueError: if a number is out of its range.
-    """
-    _require_count("num_particles", num_particles, 2)
-    _require_positive("length", length)
-    rest = np.zeros((num_particles, 3))
-    rest[:, 0] = np.linspace(-length / 2, length / 2, num_particles)
-    return rope_along(
-        rest,
-        mass=mass,
-        stretch_stiffness=stretch_stiffness,
-        bend_stiffness=bend_stiffness,
-        damping=damping,
-        drag=drag,
-        friction=friction,
-        radius=radius,
-    )
-
-
-def rope_along(
-    points: Float[np.ndarray, "N 3"],
-    *,
-    mass: float = 0.02,
-    stretch_stiffness: float = 150.0,
-    bend_stiffness: float = 3.0,
-    damping: float = 0.02,
-    drag: float = 1.0,
-    friction: float = 0.5,
-    radius: float = 0.004,
-) -> Body:
-    """A rope that is at rest along given points, which need not be evenly spread.
-
-    Args:
-        points: of the particles in order, shape (N, 3), metres; N is at least 2.
-        mass: of the whole rope, kilograms.
-        stretch_stiffness: of a spring between neighbours, newtons per metre.
-        bend_stiffness: of a spring between particles two apart, newtons per metre.
-        damping: of every spring, newton-seconds per metre.
-        drag: air drag, per second.
-        friction: Coulomb coefficient with the table.
-        radius: of the rope, metres.
-
-    Raises:
-        ValueError: if a number is out of its range, or particles joined by a spring coincide.
-    """
-    _require_count("num_particles", len(points), 2)
-    ids = np.arange(len(points))
-    stretch = np.stack([ids[:-1], ids[1:]], axis=1)
-    bend = np.stack([ids[:-2], ids[2:]], axis=1)
-    return _mass_spring(
-        "rope",
-        _on_the_table(points),
-        [(stretch, stretch_stiffness), (bend, bend_stiffness)],
-        np.zeros((0, 3), dtype=np.int64),
-        mass=mass,
-        damping=damping,
-        radius=radius,
-        drag=drag,
-        friction=friction,
-        shape=(len(points),),
-    )
-
-
-def cloth(
-    shape: tuple[int, int] = (25, 25),
-    size: tuple[float, float] = (0.3, 0.3),
-    *,
-    mass: float = 0.02,
-    stretch_stiffness: float = 1.5,
-    shear_stiffness: float = 0.5,
-    bend_stiffness: float = 0.1,
-    damping: float = 1e-3,
-    drag: float = 3.0,
-    friction: float = 0.5,
-    radius: float = 0.002,
-) -> Body:
-    """A rectangular cloth: a grid of particles, row by row, with the springs of SoftGym.
-
-    Stretch springs join the four neighbours, shear springs the diagonals, bend springs the
-    particles two apart. Particle `i * shape[1] + j` is at row `i` (along x), column `j`
-    (along y).
-
-    Args:
-        shape: number of rows and of columns, each at least 2.
-        size: extent along x and along y, metres.
-        mass: of the whole cloth, kilograms.
-        stretch_stiffness: newtons per metre, of each stretch spring.
-        shear_stiffness: newtons per metre, of each shear spring.
-        bend_stiffness: newtons per metre, of each bend spring.
-        damping: of every spring, newton-seconds per metre.
-        drag: air drag, per second.
-        friction: Coulomb coefficient with the table.
-        radius: half the thickness, metres.
-
-    Raises:
-        ValueError: if a number is out of its range.
-    """
-    for count, extent in zip(shape, size, strict=True):
-        _require_count("shape", count, 2)
-        _require_positive("size", extent)
-    rows, columns = shape
-    grid = np.arange(rows * columns).reshape(shape)
-    x = np.linspace(-size[0] / 2, size[0] / 2, rows)
-    y = np.linspace(-size[1] / 2, size[1] / 2, columns)
-    rest = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros(shape)], axis=-1).reshape(-1, 3)
-    stretch = np.concatenate([_pairs(grid[:-1], grid[1:]), _pairs(grid[:, :-1], grid[:, 1:])])
-    shear = np.concatenate(
-        [_pairs(grid[:-1, :-1], grid[1:, 1:]), _pairs(grid[:-1, 1:], grid[1:, :-1])]
-    )
-    bend = np.concatenate([_pairs(grid[:-2], grid[2:]), _pairs(grid[:, :-2], grid[:, 2:])])
-    return _mass_spring(
-        "cloth",
-        rest,
-        [(stretch, stretch_stiffness), (shear, shear_stiffness), (bend, bend_stiffness)],
-        _grid_faces(grid),
-        mass=mass,
-        damping=damping,
-        radius=radius,
-        drag=drag,
-        friction=friction,
-        shape=(rows, columns),
-    )
-
-
-def from_mesh(
-    points: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    *,
-    name: str = "mesh",
-    scale: float = 1.0,
-    density: float = 0.25,
-    stretch_stiffness: float = 4.0,
-    bend_stiffness: float = 0.5,
-    damping: float = 1e-3,
-    drag: float = 3.0,
-    friction: float = 0.5,
-    radius: float = 0.002,
-) -> Body:
-    """A sheet of any shape: particles at the points of a triangle mesh.
-
-    The mesh is cleaned first (see `jaxsimp.bodies.meshes.clean_mesh`): particles are its points in
-    their order, without copies and points of no triangle. It is at rest as it is given, its
-    lowest point put at z = 0, centred along x and y. A particle has a third of the mass of
-    each of its triangles.
-
-    Stretch springs lie along the edges, bend springs across each edge of two triangles, from
-    corner to corner. Stiffness and damping are the sheet's, shared out by the weights of
-    `jaxsimp.bodies.meshes.spring_weights`, so that in its plane the sheet does not depend to first
-    order on how finely it is meshed. On equilateral triangles its Young's modulus times
-    thickness is the sum of both stiffnesses. Out of the plane only bend springs that shorten
-    resist: that is of higher order, and weaker in a finer mesh, as in `cloth`.
-
-    Very unequal or slender triangles ask for a small time step; `jaxsimp.bodies.outlines.remesh`
-    replaces those of a flat mesh.
-
-    Args:
-        points: shape (V, 3), metres over `scale`, z up.
-        faces: point ids of the triangles, shape (F, 3).
-        name: of the kind of body.
-        scale: metres in one unit of `points`: 0.001 for millimetres.
-        density: kilograms per square metre.
-        stretch_stiffness: of the sheet, newtons per metre.
-        bend_stiffness: of the sheet, newtons per metre.
-        damping: of the sheet, newton-seconds per metre.
-        drag: air drag, per second.
-        friction: Coulomb coefficient with the table.
-        radius: half the thickness, metres.
-
-    Raises:
-        ValueError: if the mesh is refused (see `clean_mesh`), or a number is out of its range.
-    """
-    _require_positive("density", density)
-    points, faces = clean_mesh(points, faces, scale=scale)
-    (edges, along), (pairs, across) = spring_weights(points, faces)
-    springs, weight = np.concatenate([edges, pairs]), np.concatenate([along, across])
-    third = np.repeat(face_areas(points, faces) / 3, 3)
-    return Body(
-        name=name,
-        rest=_on_the_table(points),
-        mass=density * np.bincount(faces.ravel(), weights=third),
-        springs=springs,
-        rest_length=np.linalg.norm(points[springs[:, 1]] - points[springs[:, 0]], axis=1),
-        stiffness=np.concatenate([stretch_stiffness * along, bend_stiffness * across]),
-        damping=damping * weight,
-        faces=faces,
-        radius=radius,
-        drag=drag,
-        friction=friction,
-        shape=(len(points),),
-    )
-
-
-def _mass_spring(
-    name: str,
-    rest: np.ndarray,
-    families: list[tuple[np.ndarray, float]],
-    faces: np.ndarray,
-    *,
-    mass: float,
-    damping: float,
-    radius: float,
-    drag: float,
-    friction: float,
-    shape: tuple[int, ...],
-) -> Body:
-    """A body of equal particles whose springs come in families of one stiffness each."""
-    _require_positive("mass", mass)
-    springs = np.concatenate([pairs for pairs, _ in families])
-    stiffness = np.concatenate([np.full(len(pairs), value) for pairs, value in families])
-    return Body(
-        name=name,
-        rest=rest,
-        mass=np.full(len(rest), mass / len(rest)),
-        springs=springs,
-        rest_length=np.linalg.norm(rest[springs[:, 1]] - rest[springs[:, 0]], axis=1),
-        stiffness=stiffness,
-        damping=np.full(len(springs), damping),
-        faces=faces,
-        radius=radius,
-        drag=drag,
-        friction=friction,
-        shape=shape,
-    )
-
-
-def _on_the_table(points: np.ndarray) -> np.ndarray:
-    """Points moved so that the lowest is at z = 0, and the middle of their extent above it."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    return points - np.array([*(low + high)[:2] / 2, low[2]])
-
-
-def _pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    return np.stack([first.ravel(), second.ravel()], axis=1)
-
-
-def _grid_faces(grid: np.ndarray) -> np.ndarray:
-    """Two triangles a cell, counter-clockwise seen from above, shape (F, 3)."""
-    corner, right = grid[:-1, :-1].ravel(), grid[1:, :-1].ravel()
-    up, across = grid[:-1, 1:].ravel(), grid[1:, 1:].ravel()
-    return np.concatenate(
-        [np.stack([corner, right, up], axis=1), np.stack([right, across, up], axis=1)]
-    )
+        Raises:
+            TypeError: if there is no parameter of such a name.
+            ValueError: if a product is out of the parameter's range.
+        """
+        refuse_unknown(factors, FACTORS)
+        each = np.broadcast_to(stiffness, self.stiffness.shape)
+        members = [each[self.families == family] for family in range(len(FAMILIES))]
+        by_family = {
+            name: float(np.median(own if len(own) else stiffness))
+            for name, own in zip(FAMILIES, members, strict=True)
+        }
+        return replace(
+            self,
+            mass=self.mass * factors.get("mass", 1.0),
+            stiffness=self.stiffness * each,
+            damping=self.damping * factors.get("damping", 1.0),
+            material=self.material.scaled(**by_family, **factors),
+        )
 
 
 def _check_arrays(body: Body) -> None:
     count, num_springs = len(body.rest), len(body.springs)
-    _require_count("num_particles", count, 1)
+    require_count("num_particles", count, 1)
     expected = {
         "rest": (count, 3),
         "mass": (count,),
         "springs": (num_springs, 2),
+        "families": (num_springs,),
         "rest_length": (num_springs,),
         "stiffness": (num_springs,),
         "damping": (num_springs,),
@@ -365,8 +151,11 @@ def _check_arrays(body: Body) -> None:
         array = getattr(body, name)
         if array.shape != shape:
             raise ValueError(f"{name} has shape {array.shape}; {shape} is needed")
-        if not np.all(np.isfinite(array)):
-            raise ValueError(f"{name} has a value that is not finite; give finite numbers")
+        require_finite(name, array)
+
+
+def _check_ids(body: Body) -> None:
+    count = body.num_particles
     for name in ("springs", "faces"):
         ids = getattr(body, name)
         if ids.size and (ids.min() < 0 or ids.max() >= count):
@@ -374,25 +163,16 @@ def _check_arrays(body: Body) -> None:
                 f"{name} names particle {ids.max() if ids.max() >= count else ids.min()}; "
                 f"a body of {count} particles has ids 0 to {count - 1}"
             )
-    pairs, times = np.unique(np.sort(body.springs, axis=1), axis=0, return_counts=True)
+    unknown = np.flatnonzero((body.families < 0) | (body.families >= len(FAMILIES)))
+    if unknown.size:
+        raise ValueError(
+            f"families is {body.families[unknown[0]]} for spring {unknown[0]}; give 0 for "
+            f"stretch, 1 for shear or 2 for bend"
+        )
+    pairs, _, times = distinct_edges(body.springs)
     for fault, bad in (
         ("joins a particle to itself", pairs[:, 0] == pairs[:, 1]),
         ("is there twice", times > 1),
     ):
         if bad.any():
             raise ValueError(f"the spring {pairs[bad][0].tolist()} {fault}; leave it out")
-
-
-def _require_count(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise ValueError(f"{name} is {value}; at least {least} is needed")
-
-
-def _require_positive(name: str, value: float | np.ndarray) -> None:
-    if not np.all((np.asarray(value) > 0) & np.isfinite(value)):
-        raise ValueError(f"{name} is {np.min(value):g}; give a finite number above zero")
-
-
-def _require_at_least_zero(name: str, value: float | np.ndarray) -> None:
-    if not np.all((np.asarray(value) >= 0) & np.isfinite(value)):
-        raise ValueError(f"{name} is {np.min(value):g}; give a finite number, zero or more")

@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from jaxsimp.bodies.body import Body, from_mesh
+from jaxsimp.bodies.body import Body
+from jaxsimp.bodies.constructors import from_mesh
+from jaxsimp.bodies.material import MATERIALS
 from jaxsimp.bodies.outlines import mesh_symmetric_outline
-
-DENSITY = 0.3
-"""Kilograms per square metre: two layers of a light cotton."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ def towel(
         length: along y, metres.
         width: along x, metres.
         num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.body.from_mesh`; `density` is `DENSITY` by default.
+        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, or the body is refused.
@@ -88,7 +87,7 @@ def t_shirt(
         neck_depth: of the opening, metres.
         slope: of shoulders and sleeves, degrees below the x axis.
         num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.body.from_mesh`; `density` is `DENSITY` by default.
+        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, the outline is not that of a T-shirt, or
@@ -150,7 +149,7 @@ def trousers(
         cuff: across the end of a leg, metres.
         spread: how much farther out than the waist each leg ends, metres; may be below zero.
         num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.body.from_mesh`; `density` is `DENSITY` by default.
+        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, the outline is not that of trousers, or
@@ -186,7 +185,7 @@ def skirt(
         waist: across the top, metres.
         hem: across the bottom, metres.
         num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.body.from_mesh`; `density` is `DENSITY` by default.
+        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, or the body is refused.
@@ -209,7 +208,8 @@ def _sew(
 ) -> Garment:
     """A garment from the named corners of its right half."""
     points, faces, mirror = mesh_symmetric_outline(np.array(list(half.values())), num_particles)
-    body = from_mesh(points, faces, **{"name": name, "density": DENSITY, **options})
+    options = {"name": name, "material": MATERIALS["garment"], **options}
+    body = from_mesh(points, faces, **options)
     if body.num_particles != len(points):
         raise ValueError(f"the {name} has parts too small for its size; give larger dimensions")
     landmarks = {}

@@ -11,8 +11,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsimp.bodies.topology import (
+    Faces,
+    are_among,
+    connected_pieces,
+    distinct_edges,
+    half_edges,
+    inner_edges,
+    shared_half_edges,
+)
+
 Points = Float[np.ndarray, "V 3"]
-Faces = Int[np.ndarray, "F 3"]
 Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 """Points and triangles of a mesh that a function makes."""
 
@@ -114,22 +123,6 @@ def face_areas(points: Points, faces: Faces) -> Float[np.ndarray, " F"]:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
-def boundary_edges(faces: Faces) -> Int[np.ndarray, "E 2"]:
-    """Edges of one triangle only, directed as in it, shape (E, 2)."""
-    edges, _ = half_edges(faces)
-    _, where, count = _distinct_edges(edges)
-    return edges[count[where] == 1]
-
-
-def half_edges(faces: Faces) -> tuple[Int[np.ndarray, "3*F 2"], Int[np.ndarray, " 3*F"]]:
-    """Edges of each triangle, directed as in it, and the corners opposite to them.
-
-    Rows `i`, `F + i` and `2 F + i` belong to triangle `i`.
-    """
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    return edges, faces[:, [2, 0, 1]].T.ravel()
-
-
 def spring_weights(
     points: Points, faces: Faces
 ) -> tuple[
@@ -156,21 +149,16 @@ def spring_weights(
     Returns:
         Pairs of point ids, first the lower, and their weights: of the edges, then across them.
     """
-    edges, opposite = half_edges(faces)
-    area = np.tile(face_areas(points, faces), 3)
-    pairs, where, count = _distinct_edges(edges)
-    total = np.bincount(where, weights=area)
+    pairs, where, count = distinct_edges(half_edges(faces)[0])
+    total = np.bincount(where, weights=np.tile(face_areas(points, faces), 3))
     length = _lengths(points, pairs)
-    # Half-edges in the order of their edges: those of an edge of two triangles are neighbours.
-    order = np.argsort(where, kind="stable")
-    ends = np.sort(opposite[order[np.repeat(count == 2, count)]].reshape(-1, 2), axis=1)
+    ends = np.sort(inner_edges(faces)[1], axis=1)  # in the order of `pairs`, as all here
     inner = count == 2
     heights = 2 * total[inner] / length[inner]
     weight = total[inner] / np.maximum(_lengths(points, ends), heights) ** 2
-    across, group, _ = _distinct_edges(ends)
+    across, group, _ = distinct_edges(ends)
     weight = np.bincount(group, weights=weight, minlength=len(across))
-    joined = set(map(tuple, pairs.tolist()))
-    free = np.array([tuple(pair) not in joined for pair in across.tolist()], dtype=bool)
+    free = ~are_among(across, pairs)
     return (pairs, total / length**2), (across[free], weight[free])
 
 
@@ -227,15 +215,12 @@ def _check_coordinates(points: np.ndarray) -> None:
 
 def _weld(points: np.ndarray, tolerance: float) -> np.ndarray:
     """For each point the id of the first that it is one with, shape (V,)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     # Exact copies first: what is left has few pairs even where many points coincide.
     distinct, where = np.unique(points, axis=0, return_inverse=True)
     near = cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
-    graph = coo_array((np.ones(len(near)), near.T), shape=(len(distinct),) * 2)
-    group = connected_components(graph, directed=False)[1][where.ravel()]
+    group = connected_pieces(near, len(distinct))[1][where.ravel()]
     _, first, group = np.unique(group, return_index=True, return_inverse=True)
     return first[group]
 
@@ -249,7 +234,7 @@ def _without_dirt(points: np.ndarray, faces: np.ndarray, tolerance: float) -> np
         edges, _ = half_edges(faces)
         longest = _lengths(points, edges).reshape(3, -1).max(axis=0)
         empty = 2 * face_areas(points, faces) < tolerance * longest
-        _, where, count = _distinct_edges(edges)
+        _, where, count = distinct_edges(edges)
         fills = (count[where].reshape(3, -1) == 2).all(axis=0)
         if not (empty & ~fills).any():
             break
@@ -259,9 +244,7 @@ def _without_dirt(points: np.ndarray, faces: np.ndarray, tolerance: float) -> np
 
 def _check_edges(points: np.ndarray, faces: np.ndarray) -> None:
     """Refuse edges of more than two triangles, and a mesh of several pieces."""
-    from scipy.sparse.csgraph import connected_components
-
-    pairs, _, count = _distinct_edges(half_edges(faces)[0])
+    pairs, _, count = distinct_edges(half_edges(faces)[0])
     crowded = np.flatnonzero(count > 2)
     if crowded.size:
         start, end = points[pairs[crowded[0]]].round(4).tolist()
@@ -269,8 +252,7 @@ def _check_edges(points: np.ndarray, faces: np.ndarray) -> None:
             f"{count[crowded[0]]} triangles meet at the edge from {start} to {end} "
             f"({crowded.size} such edges); a sheet has two at most: cut it there"
         )
-    first, second, _ = _neighbours(faces)
-    number, piece = connected_components(_graph(first, second, len(faces)), directed=False)
+    number, piece = connected_pieces(inner_edges(faces)[2], len(faces))
     if number > 1:
         sizes = sorted(np.bincount(piece).tolist(), reverse=True)
         listed = ", ".join(map(str, sizes[:8])) + (", ..." if number > 8 else "")
@@ -286,45 +268,19 @@ def _oriented(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     Each triangle is two nodes of a graph: as it is, and turned. Neighbours that run along their
     edge in opposite directions agree as they are, the others when one is turned.
     """
-    from scipy.sparse.csgraph import connected_components
-
     count = len(faces)
-    first, second, agree = _neighbours(faces)
+    edges, rows = half_edges(faces)[0], shared_half_edges(faces)
+    first, second = rows.T % count
+    agree = edges[rows[:, 0], 0] == edges[rows[:, 1], 1]
     other = np.where(agree, second, second + count)
-    graph = _graph(
-        np.concatenate([first, first + count]),
-        np.concatenate([other, (other + count) % (2 * count)]),
-        2 * count,
-    )
-    _, side = connected_components(graph, directed=False)
+    as_they_are = np.stack([first, other], axis=1)
+    turned = (as_they_are + count) % (2 * count)
+    _, side = connected_pieces(np.concatenate([as_they_are, turned]), 2 * count)
     if side[0] == side[count]:
         raise ValueError(
             "the mesh has one side only, like a Möbius strip; cut it open across the strip"
         )
     return np.where((side[:count] == side[0])[:, None], faces, faces[:, ::-1])
-
-
-def _neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangles that share an edge, as two rows of ids, and whether they face the same way."""
-    edges, _ = half_edges(faces)
-    _, where, count = _distinct_edges(edges)
-    order = np.argsort(where, kind="stable")
-    first, second = order[np.repeat(count == 2, count)].reshape(-1, 2).T
-    return first % len(faces), second % len(faces), edges[first, 0] == edges[second, 1]
-
-
-def _graph(first: np.ndarray, second: np.ndarray, count: int) -> "object":
-    from scipy.sparse import coo_array
-
-    return coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
-
-
-def _distinct_edges(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Edges whatever their direction: each once, its id for every row, and its number of rows."""
-    pairs, where, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return pairs, where.ravel(), count
 
 
 def _lengths(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ triangulation. (Smoothing was tried: it made no angle larger.) Nothing is random
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.meshes import Faces, Mesh, Points, boundary_edges, clean_mesh, face_areas
+from jaxsimp.bodies.meshes import Mesh, Points, clean_mesh, face_areas
+from jaxsimp.bodies.topology import Faces, boundary_edges, boundary_loops, distinct_edges
 
 Corners = Float[np.ndarray, "C 2"]
 
@@ -92,7 +93,7 @@ def remesh(points: Points, faces: Faces, num_points: int) -> Mesh:
     """
     points, faces = clean_mesh(points, faces)
     flat = _laid_flat(points)
-    loops = _boundary_loops(faces)
+    loops = boundary_loops(faces)
     if len(loops) != 1:
         raise ValueError(
             f"the mesh has {len(loops)} boundaries; only a flat one without holes, with one "
@@ -202,8 +203,8 @@ def _triangulate(
     ring = np.argsort(order)  # ids of the points along the outline
     points = np.concatenate([sides[order], inside])
     faces = _delaunay(points, corners)
-    found = np.unique(np.sort(boundary_edges(faces), axis=1), axis=0)
-    wanted = np.unique(np.sort(np.stack([ring, np.roll(ring, -1)], axis=1), axis=1), axis=0)
+    found, _, _ = distinct_edges(boundary_edges(faces)[0])
+    wanted, _, _ = distinct_edges(np.stack([ring, np.roll(ring, -1)], axis=1))
     if not np.array_equal(found, wanted):
         raise ValueError(
             f"the outline has parts too narrow for {len(points)} points; ask for more points, "
@@ -241,22 +242,6 @@ def _laid_flat(points: np.ndarray) -> np.ndarray:
     cross = np.cross(np.eye(3), axis)  # of which the rows are e x axis
     turn = np.eye(3) + cross + cross @ cross / (1 + normal[2])
     return (centred @ turn.T)[:, :2]
-
-
-def _boundary_loops(faces: np.ndarray) -> list[list[int]]:
-    """Point ids along each boundary."""
-    edges = boundary_edges(faces)
-    after = dict(edges.tolist())
-    if len(after) < len(edges):
-        raise ValueError("the boundary touches itself at a point; cut the mesh there")
-    loops = []
-    while after:
-        start = next(iter(after))
-        loop = [start]
-        while (point := after.pop(loop[-1])) != start:
-            loop.append(point)
-        loops.append(loop)
-    return loops
 
 
 def _simplified(outline: np.ndarray) -> np.ndarray:

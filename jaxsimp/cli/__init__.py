@@ -1,1 +1,5 @@
-"""The console command `jaxsimp`: one module a verb, for a user's own files."""
+"""The console command `jaxsimp`: one module a verb, for a user's own files.
+
+A verb is a module of this package with a dataclass `Options`, whose fields are the options of the
+command line and whose method `run()` returns the exit status. `main.VERBS` lists the verbs.
+"""

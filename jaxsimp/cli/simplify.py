@@ -1,35 +1,33 @@
-"""Key points of goals in files: `python -m jaxsimp.cli.simplify GOAL`."""
+"""The verb `simplify`: key points of goals in files.
 
+Rooms are loaded by the face when they are used, so that `jaxsimp --help` waits for none of them.
+"""
+
+import math
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jaxsimp import records
-from jaxsimp.bodies import Body
-from jaxsimp.goals import Positions, load_goal
-from jaxsimp.goals.files import load_body
-from jaxsimp.simplification import METHODS, FitStatus, KeyPoints, simplify_batch
+import jaxsimp
 
 NO_MODEL = 1
-"""Exit status if some goal has no model within the tolerance."""
-REFUSED = 2
-"""Exit status for wrong input."""
+"""Exit status if some goal has no model within the tolerance and the workspace."""
 PICTURES = (".jpg", ".pdf", ".png", ".svg")
 MOST_PICTURED = 40
 """Most goals in one picture: matplotlib draws up to 65,536 pixels, 500 of them a goal."""
+XYZ = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Options:
-    """Key points of goals: the particles that are worth grasping to reach them.
+    """Key points of goals in files: the particles that are worth grasping to reach them.
 
     A goal is an .npz file with `positions` (N x 3, metres, z up, the table at z = 0). It may
     define its body: by `rest` (N x 2 or N x 3) and `faces` (F x 3) a sheet, without faces a
@@ -40,7 +38,11 @@ class Options:
     With --body a goal may also be a mesh file, whose points are the body's, in its order.
     Goals of one body are one batch: give --body, or the same rest and faces.
 
-    The exit status is 0, 1 if a goal has no model within the tolerance, 2 for wrong input.
+    Models of ropes keep to a workspace: --lower, --upper, --above-table, --fixed-ends and
+    --max-stretch. A goal that has no model within it has the status INFEASIBLE.
+
+    The exit status is 0, 1 if a goal has no model within the tolerance and the workspace, 2 for
+    wrong input.
     """
 
     goals: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="GOAL ...")]
@@ -52,6 +54,17 @@ class Options:
     """How: robust, paper (section III-A), or meshlab (the paper's own tool, an extra)."""
     tolerance: float | None = None
     """Error below which a model fits, metres; the method's own by default."""
+    lower: Annotated[XYZ | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Lowest x, y and z of a rope's model, metres; -inf for no limit."""
+    upper: Annotated[XYZ | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Highest x, y and z of a rope's model, metres; inf for no limit."""
+    above_table: bool = False
+    """Keep a rope's model the rope's radius above the table at z = 0."""
+    fixed_ends: bool = False
+    """Keep the ends of a rope's model at the ends of the goal."""
+    max_stretch: float | None = None
+    """Largest elongation of a segment of a rope's model, as a fraction of its rest length (0.05
+    for 5 %)."""
     json: Path | None = None
     """File for the result: an object, or a list of them for several goals."""
     figure: Path | None = None
@@ -62,14 +75,16 @@ class Options:
 
         Raises:
             ValueError: if there is no goal or no such method, the tolerance is not above zero,
-                or a path cannot be written to or is that of another file.
+                the workspace is none, or a path cannot be written to or is that of another file.
         """
         if not self.goals:
             raise ValueError("no goal is given; name at least one file")
-        if self.method not in METHODS:
-            raise ValueError(f"unknown method {self.method!r}; choose from {', '.join(METHODS)}")
-        if self.tolerance is not None and not 0 < self.tolerance < np.inf:
+        if self.method not in jaxsimp.METHODS:
+            known = ", ".join(jaxsimp.METHODS)
+            raise ValueError(f"unknown method {self.method!r}; choose from {known}")
+        if self.tolerance is not None and not 0 < self.tolerance < math.inf:
             raise ValueError(f"tolerance is {self.tolerance:g}; give metres, above zero")
+        self.workspace()
         used = [path.resolve() for path in (*self.goals, self.body) if path]
         for name, path in (("--json", self.json), ("--figure", self.figure)):
             if path is None:
@@ -83,6 +98,44 @@ class Options:
             used.append(path.resolve())
         if self.figure:
             _check_figure(self.figure, len(self.goals))
+
+    def workspace(self) -> "jaxsimp.Workspace | None":
+        """The workspace that the options give; None if they give none.
+
+        Raises:
+            ValueError: if a bound or `max_stretch` is out of its range.
+        """
+        given = {
+            "lower": self.lower,
+            "upper": self.upper,
+            "above_table": self.above_table or None,
+            "fixed_ends": self.fixed_ends or None,
+            "max_stretch": self.max_stretch,
+        }
+        limits: dict[str, Any] = {name: each for name, each in given.items() if each is not None}
+        return jaxsimp.Workspace(**limits) if limits else None
+
+    def run(self) -> int:
+        """Simplify the goals, print a table, and write what was asked for.
+
+        Returns:
+            The exit status: 0, or `NO_MODEL`.
+
+        Raises:
+            ValueError: if a file or an option is refused; nothing is written then.
+            OSError: if a file cannot be written.
+        """
+        self.check()
+        models = simplified(self)
+        console = Console(width=None if sys.stdout.isatty() else 160)  # a file has no width
+        console.print(table(models))
+        if self.json:
+            rows = [row(model, self.method) for model in models]
+            jaxsimp.records.write_json(self.json, rows[0] if len(rows) == 1 else rows)
+        if self.figure:
+            save_figure(models, self.figure)
+        fits = jaxsimp.FitStatus.FITS
+        return 0 if all(model.key_points.status == fits for model in models) else NO_MODEL
 
 
 def _check_figure(path: Path, num_goals: int) -> None:
@@ -108,32 +161,10 @@ class SimplifiedGoal:
     """
 
     path: Path
-    body: Body
-    goal: Positions
-    key_points: KeyPoints
+    body: "jaxsimp.Body"
+    goal: "jaxsimp.goals.Positions"
+    key_points: "jaxsimp.KeyPoints"
     seconds: float
-
-
-def main() -> int:
-    """Run the command line; the exit status is 0, 1 if a goal has no model, 2 for wrong input."""
-    options = tyro.cli(Options, prog="python -m jaxsimp.cli.simplify")
-    console = Console(width=None if sys.stdout.isatty() else 160)  # a file has no width
-    try:
-        options.check()
-        models = simplified(options)
-        console.print(table(models))
-        if options.json:
-            rows = [row(model, options.method) for model in models]
-            records.write_json(options.json, rows[0] if len(rows) == 1 else rows)
-        if options.figure:
-            save_figure(models, options.figure)
-    except (ValueError, OSError) as error:
-        told = " ".join(str(error).split())
-        Console(stderr=True).print(
-            f"error: {told}", style="red", markup=False, highlight=False, soft_wrap=True
-        )
-        return REFUSED
-    return 0 if all(model.key_points.status == FitStatus.FITS for model in models) else NO_MODEL
 
 
 def simplified(options: Options) -> list[SimplifiedGoal]:
@@ -142,6 +173,8 @@ def simplified(options: Options) -> list[SimplifiedGoal]:
     Raises:
         ValueError: if a file or an option is refused.
     """
+    from jaxsimp.goals import load_body, load_goal
+
     body = load_body(options.body) if options.body else None
     loaded = [load_goal(path, body) for path in options.goals]
     # Files that define their bodies alike are goals of one body.
@@ -150,15 +183,35 @@ def simplified(options: Options) -> list[SimplifiedGoal]:
         batches.setdefault((made.rest.tobytes(), made.faces.tobytes()), []).append(index)
     models: dict[int, SimplifiedGoal] = {}
     for indices in batches.values():
-        made, goals = loaded[indices[0]][0], [loaded[index][1] for index in indices]
-        start = time.perf_counter()
-        found = simplify_batch(
-            made, np.stack(goals), method=options.method, tolerance=options.tolerance
-        )
-        seconds = (time.perf_counter() - start) / len(found)
-        for index, goal, key_points in zip(indices, goals, found, strict=True):
-            models[index] = SimplifiedGoal(options.goals[index], made, goal, key_points, seconds)
+        paths = [options.goals[index] for index in indices]
+        goals = [loaded[index][1] for index in indices]
+        batch = _simplified_batch(options, loaded[indices[0]][0], paths, goals)
+        models.update(zip(indices, batch, strict=True))
     return [models[index] for index in range(len(loaded))]
+
+
+def _simplified_batch(
+    options: Options,
+    body: "jaxsimp.Body",
+    paths: list[Path],
+    goals: "list[jaxsimp.goals.Positions]",
+) -> list[SimplifiedGoal]:
+    """Models of the goals of one body."""
+    import numpy as np
+
+    start = time.perf_counter()
+    found = jaxsimp.simplify_batch(
+        body,
+        np.stack(goals),
+        method=options.method,
+        tolerance=options.tolerance,
+        workspace=options.workspace(),
+    )
+    seconds = (time.perf_counter() - start) / len(found)
+    return [
+        SimplifiedGoal(path, body, goal, key_points, seconds)
+        for path, goal, key_points in zip(paths, goals, found, strict=True)
+    ]
 
 
 def row(model: SimplifiedGoal, method: str) -> dict[str, Any]:
@@ -180,13 +233,13 @@ def row(model: SimplifiedGoal, method: str) -> dict[str, Any]:
         "errors": dict(zip(map(str, found.sizes), errors, strict=True)),
         "seconds": model.seconds,
         "num_particles": model.body.num_particles,
-        "environment": records.environment(),
+        "environment": jaxsimp.records.environment(),
     }
 
 
 def _number(error: float) -> float | None:
     """An error as JSON, which has no infinity: there is no model of that size."""
-    return float(error) if np.isfinite(error) else None
+    return float(error) if math.isfinite(error) else None
 
 
 def table(models: list[SimplifiedGoal]) -> Table:
@@ -217,8 +270,6 @@ def save_figure(models: list[SimplifiedGoal], path: Path) -> None:
     """A picture of the goals with their models and errors, a row a goal."""
     import matplotlib.pyplot as plt
 
-    from jaxsimp.viz import plot_simplifications
-
     stems = [model.path.stem for model in models]
     shown = {
         # The whole path where files of several folders have the same name.
@@ -229,10 +280,6 @@ def save_figure(models: list[SimplifiedGoal], path: Path) -> None:
         )
         for stem, model in zip(stems, models, strict=True)
     }
-    figure = plot_simplifications(shown)
+    figure = jaxsimp.viz.plot_simplifications(shown)
     figure.savefig(path, dpi=150)
     plt.close(figure)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

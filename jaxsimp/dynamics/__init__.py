@@ -1,7 +1,7 @@
 """Differentiable mass-spring dynamics: a body and actions become motion."""
 
 from jaxsimp.dynamics.pickers import NONE, Actions, Pickers, make_pickers
-from jaxsimp.dynamics.rollout import rollout, settle
+from jaxsimp.dynamics.rollouts import rollout, rollout_observing, settle
 from jaxsimp.dynamics.simulation import (
     Simulation,
     State,
@@ -21,5 +21,6 @@ __all__ = [
     "make_pickers",
     "make_simulation",
     "rollout",
+    "rollout_observing",
     "settle",
 ]

@@ -12,6 +12,9 @@ from jaxsimp.bodies import Body
 from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_contact
 from jaxsimp.dynamics.springs import Springs, make_springs
 
+PHYSICS = ("mass", "radius", "drag", "friction", "gravity", "time_step")
+"""Fields of `Simulation` that velocities depend on, besides springs: those with a cotangent."""
+
 
 @partial(
     jax.tree_util.register_dataclass,
@@ -37,17 +40,7 @@ class State:
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=[
-        "springs",
-        "rest",
-        "mass",
-        "radius",
-        "drag",
-        "friction",
-        "gravity",
-        "time_step",
-        "self_contact",
-    ],
+    data_fields=["springs", "rest", *PHYSICS, "self_contact"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -119,8 +112,8 @@ def make_simulation(
         rest=array(body.rest),
         mass=array(body.mass),
         radius=array(body.radius),
-        drag=array(body.drag),
-        friction=array(body.friction),
+        drag=array(body.material.drag),
+        friction=array(body.material.friction),
         gravity=array(gravity),
         time_step=array(time_step),
         self_contact=(
@@ -150,7 +143,7 @@ def largest_time_step(body: Body) -> float:
     half the step is safe for it.
     """
     k = _largest_eigenvalue(body, body.stiffness)
-    c = _largest_eigenvalue(body, body.damping) + body.drag
+    c = _largest_eigenvalue(body, body.damping) + body.material.drag
     # The positive root of k dt^2 + 2 c dt - 4 = 0, in a form that allows k = 0; it is
     # never beyond 2 / c.
     denominator = c + np.sqrt(c**2 + 4 * k)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsimp.dynamics.contact.table import table_contact
-from jaxsimp.dynamics.simulation import Simulation, State
+from jaxsimp.dynamics.simulation import PHYSICS, Simulation, State
 from jaxsimp.dynamics.springs import (
     over_batch,
     pull,
@@ -93,8 +93,7 @@ def step_vjp(
     position_bar, velocity_bar = packed_bar
     moved_bar = [v + dt * x for x, v in zip(position_bar, velocity_bar, strict=True)]
     # Only parameters that the velocities depend on: ids have no cotangent.
-    names = ("mass", "radius", "drag", "friction", "gravity", "time_step")
-    physics: dict[str, Any] = {name: getattr(simulation, name) for name in names}
+    physics: dict[str, Any] = {name: getattr(simulation, name) for name in PHYSICS}
 
     def constrained(physics: dict[str, Any], drive: Axes, free: Axes, height: Array) -> Axes:
         changed = dataclasses.replace(simulation, **physics)
@@ -152,8 +151,7 @@ def _constrained(
     height: Float[Array, "N *B"],
 ) -> Axes:
     """Velocities after contact and pickers."""
-    above = height - simulation.radius
-    moved = table_contact(above, free, simulation.friction, simulation.time_step)
+    moved = table_contact(simulation, height, free)
     return [jnp.where(held, drive[axis] * share, moved[axis]) for axis in range(3)]
 
 

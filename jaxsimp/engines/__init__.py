@@ -1,7 +1,41 @@
 """Engines: what carries out plans. Our springs, ensembles of them, MJX, and MuJoCo."""
 
-from jaxsimp.engines.engine import Engine, Observe
+from jaxsimp.engines.engine import (
+    Engine,
+    Execution,
+    ExecutionStatus,
+    Executor,
+    Observe,
+    SearchEngine,
+    then_idle,
+)
 from jaxsimp.engines.ensemble import Ensemble, Spread, make_ensemble
-from jaxsimp.engines.springs import MassSprings
+from jaxsimp.engines.mjx import MJX, compare_with_mjx
+from jaxsimp.engines.mujoco import MuJoCo, replay
+from jaxsimp.engines.population import Layout, PopulationMap, default_layout
+from jaxsimp.engines.rollouts import plan_cost, settled_score
+from jaxsimp.engines.springs import MassSprings, spring_chunk_size
 
-__all__ = ["Engine", "Ensemble", "MassSprings", "Observe", "Spread", "make_ensemble"]
+__all__ = [
+    "MJX",
+    "Engine",
+    "Ensemble",
+    "Execution",
+    "ExecutionStatus",
+    "Executor",
+    "Layout",
+    "MassSprings",
+    "MuJoCo",
+    "Observe",
+    "PopulationMap",
+    "SearchEngine",
+    "Spread",
+    "compare_with_mjx",
+    "default_layout",
+    "make_ensemble",
+    "plan_cost",
+    "replay",
+    "settled_score",
+    "spring_chunk_size",
+    "then_idle",
+]

@@ -1,4 +1,4 @@
-"""Ensembles: the same body under several physics, so that a plan is judged by all of them.
+"""Ensembles: the same body under several physics, so that a plan is evaluated in all of them.
 
 A plan found in one simulation may owe its cost to that simulation's numbers. Here a plan's cost is
 taken over members whose stiffness, damping, drag, friction, mass and time step are the body's own
@@ -6,18 +6,19 @@ times factors; see Mordatch, Lowrey and Todorov, "Ensemble-CIO", IROS 2015.
 """
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from jaxsimp.bodies import Body
-from jaxsimp.dynamics import Actions, Pickers, Simulation
-from jaxsimp.tasks import Episode, Task
+from jaxsimp.dynamics import Actions, Simulation, State, rollout_observing
+from jaxsimp.engines.engine import Executor, Observe
+from jaxsimp.engines.rollouts import RolloutExecutor
+from jaxsimp.engines.springs import MassSprings, Physics, spring_chunk_size
+from jaxsimp.tasks import Task
 
 MOST_REFINEMENT = 4.0
 """A spread that needs a time step shorter than the task's by more than this is refused."""
@@ -62,7 +63,7 @@ QUANTITIES = tuple(field.name for field in dataclasses.fields(Spread))
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Simulations of one body under different physics, and how costs in them become one.
+    """An engine: one body under E physics; a plan's cost is its risk over them.
 
     Attributes:
         simulations: stacked: every leaf has a first axis `E`. Member 0 is the body itself.
@@ -94,20 +95,58 @@ class Ensemble:
         """Number of members, `E`."""
         return len(self.factors)
 
-    def physics(self, task: Task) -> tuple[Simulation, Pickers]:
-        """The stacked simulations, and pickers that take their number of time steps."""
+    def physics(self, task: Task) -> Physics:
+        """The stacked simulations, and pickers that take their number of time steps.
+
+        Raises:
+            ValueError: if the ensemble is of a body with another number of particles.
+        """
+        found = self.simulations.mass.shape[1]
+        if found != task.body.num_particles:
+            raise ValueError(
+                f"the ensemble is of {found} particles and {task.name} has "
+                f"{task.body.num_particles}; make one of this task"
+            )
         return self.simulations, dataclasses.replace(task.pickers(), steps=self.action_steps)
 
-    def cost(self, costs: Float[np.ndarray, "B E"]) -> Float[np.ndarray, " B"]:
-        """Cost of each plan from those in the members: not finite if one of them is not."""
-        failed = ~np.isfinite(costs).all(axis=1)
-        costs = np.where(failed[:, None], 0.0, costs)
-        mean = costs.mean(axis=1)
+    def rollout(
+        self, physics: Physics, state: State, actions: Actions, observe: Observe
+    ) -> tuple[State, PyTree[Any]]:
+        """Carry out a plan in every member: states and observations have a first axis `E`.
+
+        A loop, not one more axis of a batch: under `vmap` over plans all of a batch share the
+        simulation, and their time steps run with the batch last; see batching.py.
+        """
+        simulations, pickers = physics
+
+        def one(simulation: Simulation) -> tuple[State, PyTree[Any]]:
+            return rollout_observing(simulation, pickers, state, actions, observe)
+
+        return jax.lax.map(one, simulations)
+
+    def risk(self, costs: Float[Array, " E"]) -> Float[Array, ""]:
+        """Cost of a plan from those in the members: infinite if one of them is not finite."""
+        failed = ~jnp.isfinite(costs).all()
+        costs = jnp.where(failed, 0.0, costs)
         if self.statistic == "worst":
-            cost = costs.max(axis=1)
+            cost = costs.max()
         else:
-            cost = mean + self.caution * costs.std(axis=1) if self.caution else mean
-        return np.where(failed, np.inf, cost)
+            cost = costs.mean() + self.caution * costs.std() if self.caution else costs.mean()
+        return jnp.where(failed, jnp.inf, cost)
+
+    def chunk_size(self, physics: Physics) -> int:
+        """As of its members."""
+        return spring_chunk_size(_member_of(physics, 0)[0])
+
+    def executor(self, task: Task) -> Executor:
+        """Carries out plans in member 0, the body itself."""
+        alone = MassSprings(self.simulations.self_contact is not None)
+        return RolloutExecutor(task, alone, _member_of(self.physics(task), 0))
+
+
+def _member_of(physics: Physics, index: int) -> Physics:
+    """The physics of one member."""
+    return jax.tree.map(lambda leaf: leaf[index], physics[0]), physics[1]
 
 
 def make_ensemble(
@@ -145,7 +184,7 @@ def make_ensemble(
         raise ValueError(f"size is {size}; an ensemble has at least 1 member")
     spread = spread or Spread()
     factors = draw_factors(size, seed, spread)
-    members = [_member(task, dict(zip(QUANTITIES, row, strict=True))) for row in factors]
+    members = [_scaled_task(task, dict(zip(QUANTITIES, row, strict=True))) for row in factors]
     durations = factors[:, QUANTITIES.index("time_step")]
     # A member's own time step is nine tenths of its largest, or the task's longest.
     step = min(member.time_step / each for member, each in zip(members, durations, strict=True))
@@ -179,53 +218,10 @@ def draw_factors(size: int, seed: int, spread: Spread) -> Float[np.ndarray, "E Q
     return np.concatenate([np.ones((1, shape[1])), np.exp((2 * place - 1) * largest)])
 
 
-def _member(task: Task, factors: dict[str, float]) -> Task:
+def _scaled_task(task: Task, factors: dict[str, float]) -> Task:
     """The task with a body of other physics; its longest time step has the factor, too."""
     return dataclasses.replace(
         task,
-        body=scaled_body(task.body, **{k: v for k, v in factors.items() if k != "time_step"}),
+        body=task.body.scaled(**{k: v for k, v in factors.items() if k != "time_step"}),
         longest_time_step=task.longest_time_step * factors["time_step"],
     )
-
-
-def scaled_body(
-    body: Body,
-    *,
-    stiffness: float = 1.0,
-    damping: float = 1.0,
-    drag: float = 1.0,
-    friction: float = 1.0,
-    mass: float = 1.0,
-) -> Body:
-    """The body with its physics times factors."""
-    return dataclasses.replace(
-        body,
-        stiffness=stiffness * body.stiffness,
-        damping=damping * body.damping,
-        drag=drag * body.drag,
-        friction=friction * body.friction,
-        mass=mass * body.mass,
-    )
-
-
-PlanCost = Callable[[tuple[tuple[Simulation, Pickers], Episode], Actions], Float[Array, ""]]
-
-
-def over_members(cost_fn: PlanCost) -> Callable[[Any, Actions], Float[Array, " E"]]:
-    """The costs of a plan in each of stacked simulations, from the function of one simulation.
-
-    A loop, not one more axis of a batch: under `vmap` over plans all of a batch share the
-    simulation, and their time steps run with the batch last; see batching.py.
-    """
-
-    def costs(
-        shared: tuple[tuple[Simulation, Pickers], Episode], actions: Actions
-    ) -> Float[Array, " E"]:
-        (simulations, pickers), episode = shared
-
-        def one(simulation: Simulation) -> Float[Array, ""]:
-            return cost_fn(((simulation, pickers), episode), actions)
-
-        return jax.lax.map(one, simulations)
-
-    return costs

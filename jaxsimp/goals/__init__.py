@@ -6,7 +6,7 @@ goal enters, `load_goal` the one for goals in files.
 """
 
 from jaxsimp.goals.check import as_goal, check_goal
-from jaxsimp.goals.files import load_goal
+from jaxsimp.goals.files import load_body, load_goal
 from jaxsimp.goals.folds import (
     Fold,
     fold,
@@ -38,6 +38,7 @@ __all__ = [
     "leg_over_leg",
     "letter",
     "lift_crossings",
+    "load_body",
     "load_goal",
     "polyline",
     "rectangle_folds",

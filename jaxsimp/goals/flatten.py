@@ -11,7 +11,14 @@ loss, its scale lowered in stages).
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.meshes import LARGEST, WELD, Faces, half_edges
+from jaxsimp.bodies.meshes import LARGEST, WELD
+from jaxsimp.bodies.topology import (
+    Faces,
+    connected_pieces,
+    distinct_edges,
+    half_edges,
+    inner_edges,
+)
 from jaxsimp.goals.shapes import Positions
 
 SCALES = (1.0, 0.3, 0.1)
@@ -69,13 +76,9 @@ def flatten(positions: Positions, faces: Faces) -> Float[np.ndarray, "N 2"]:
 
 def _edges_of_disc(faces: np.ndarray, num_points: int) -> Int[np.ndarray, "E 2"]:
     """The edges of triangles that make one disc of all points, shape (E, 2)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     _check_ids(faces, num_points)
-    edges, count = np.unique(np.sort(half_edges(faces)[0], axis=1), axis=0, return_counts=True)
-    graph = coo_array((np.ones(len(edges)), edges.T), shape=(num_points,) * 2)
-    pieces = connected_components(graph, directed=False)[0]
+    edges, _, count = distinct_edges(half_edges(faces)[0])
+    pieces, _ = connected_pieces(edges, num_points)
     border = np.bincount(edges[count == 1].ravel(), minlength=num_points)
     euler = num_points - len(edges) + len(faces)
     faults = {
@@ -167,13 +170,9 @@ def _fit_lengths(
 
 def _num_turned(points: np.ndarray, faces: np.ndarray) -> int:
     """Number of edges whose two triangles lie on the same side of them."""
-    edges, opposite = half_edges(faces)
-    ids = np.sort(edges, axis=1)
-    order = np.lexsort(ids.T)
-    same = np.flatnonzero((ids[order[1:]] == ids[order[:-1]]).all(axis=1))
-    first, second = order[same], order[same + 1]
-    start, end = points[ids[first]].transpose(1, 0, 2)
-    sides = [_cross(end - start, points[opposite[one]] - start) for one in (first, second)]
+    edges, opposite, _ = inner_edges(faces)
+    start, end = points[np.sort(edges, axis=1)].transpose(1, 0, 2)
+    sides = [_cross(end - start, points[corner] - start) for corner in opposite.T]
     return int(np.sum(sides[0] * sides[1] >= 0))
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.garments import Garment
-from jaxsimp.bodies.meshes import boundary_edges, half_edges
+from jaxsimp.bodies.topology import boundary_edges, half_edges
 from jaxsimp.goals.shapes import Positions, flat
 
 
@@ -173,7 +173,7 @@ def _height_covered(body: Body, folded: np.ndarray, moves: np.ndarray) -> float:
     from scipy.spatial import cKDTree
 
     inner = moves.copy()
-    inner[np.unique(boundary_edges(body.faces))] = False
+    inner[boundary_edges(body.faces)[0]] = False
     covering, still = folded[inner if inner.any() else moves], folded[~moves]
     if not len(still):
         return 0.0

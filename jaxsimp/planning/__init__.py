@@ -1,33 +1,50 @@
-"""Planning: a task and the particles that may be grasped become a plan."""
+"""Planning: a task and the particles that may be grasped become a plan.
 
-from jaxsimp.planning.cem import CEMConfig, Search, search
-from jaxsimp.planning.encodings import (
-    ENCODINGS,
-    ActionSpace,
-    Categorical,
-    Encoding,
-    GaussianIndex,
-    Joint,
-)
-from jaxsimp.planning.evaluate import Layout, PopulationMap, default_layout
-from jaxsimp.planning.plan import Execution, Plan, Planner, load_plan, save_plan
+A *problem* gives the cost of plans; an *algorithm*, one file each, asks for costs and is told them;
+`optimize` and `Planner` run algorithms on problems.
+"""
+
+from jaxsimp.planning.algorithm import PRICES, Algorithm, Defaults, Sequence, Told, Wants, price
+from jaxsimp.planning.archive import Archive
+from jaxsimp.planning.cem import CEM
+from jaxsimp.planning.descent import Descent
+from jaxsimp.planning.encodings import ENCODINGS, Categorical, Encoding, GaussianIndex, Joint
+from jaxsimp.planning.host import search_on_host
+from jaxsimp.planning.loop import Optimum, optimize
+from jaxsimp.planning.planner import Plan, Planner
+from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_space, make_problem
+from jaxsimp.planning.random_shooting import RandomShooting
+from jaxsimp.planning.reranking import Reranking
+from jaxsimp.planning.space import ActionSpace, Plans
 
 __all__ = [
+    "CEM",
     "ENCODINGS",
+    "PRICES",
     "ActionSpace",
-    "CEMConfig",
+    "Algorithm",
+    "Archive",
+    "Candidates",
     "Categorical",
+    "Defaults",
+    "Descent",
     "Encoding",
-    "Execution",
     "GaussianIndex",
     "Joint",
-    "Layout",
+    "Optimum",
     "Plan",
     "Planner",
-    "PopulationMap",
-    "Search",
-    "default_layout",
-    "load_plan",
-    "save_plan",
-    "search",
+    "Plans",
+    "Problem",
+    "RandomShooting",
+    "Reranking",
+    "Sequence",
+    "TaskProblem",
+    "Told",
+    "Wants",
+    "action_space",
+    "make_problem",
+    "optimize",
+    "price",
+    "search_on_host",
 ]

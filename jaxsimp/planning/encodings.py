@@ -1,8 +1,7 @@
-"""Encodings: how the distribution that CEM searches with is turned into actions.
+"""Encodings: distributions over plans, for the cross-entropy method.
 
-Both encodings draw, for each action and picker, a *choice* among the K candidates or None,
-and a displacement within the limits. They share one interface: `init`, `sample`, `decode`,
-`update`; distributions and samples are pytrees, and all functions are pure.
+An encoding draws, for each action and picker, a *choice* among the K candidates or none, and a
+displacement within the limits. Distributions and samples are pytrees, and all functions are pure.
 """
 
 from dataclasses import dataclass
@@ -13,35 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from jaxsimp.dynamics import NONE, Actions
-
-
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["candidates", "limits"],
-    meta_fields=["num_actions", "num_pickers"],
-)
-@dataclass(frozen=True)
-class ActionSpace:
-    """The plans that may be searched.
-
-    Attributes:
-        candidates: ids of the particles that may be grasped, shape (K,).
-        limits: largest displacement of one action along x, y, z, shape (3,), metres.
-        num_actions: `T`, static.
-        num_pickers: `G`, static.
-    """
-
-    candidates: Int[Array, " K"]
-    limits: Float[Array, " 3"]
-    num_actions: int
-    num_pickers: int
-
-    def actions(self, choice: Int[Array, "*B T G"], direction: Float[Array, "*B T G 3"]) -> Actions:
-        """The actions of choices (K means None) and displacements in units of the limits."""
-        ids = jnp.append(self.candidates, NONE)
-        limits = jnp.broadcast_to(self.limits, direction.shape)
-        return Actions(ids[choice], direction * limits)
+from jaxsimp.planning.space import ActionSpace, Plans
 
 
 @runtime_checkable
@@ -63,14 +34,18 @@ class Encoding(Protocol):
         """Draw `num` samples, leading axis `num` on every leaf."""
         ...
 
-    def decode(self, space: ActionSpace, sample: PyTree[Any]) -> Actions:
-        """The actions of one sample, or of samples along leading axes."""
+    def decode(self, space: ActionSpace, sample: PyTree[Any]) -> Plans:
+        """The plan of one sample, or plans of samples along leading axes."""
+        ...
+
+    def encode(self, space: ActionSpace, plans: Plans) -> PyTree[Any]:
+        """A sample of each plan, along the leading axes of the plans."""
         ...
 
     def update(
         self, space: ActionSpace, distribution: PyTree[Any], elites: PyTree[Any], smoothing: float
     ) -> PyTree[Any]:
-        """Fit to the elites, keeping the share `smoothing` of the distribution before."""
+        """Fit to the elites, keeping the fraction `smoothing` of the distribution before."""
         ...
 
     def mean(self, space: ActionSpace, distribution: PyTree[Any]) -> PyTree[Any]:
@@ -120,11 +95,16 @@ class GaussianIndex:
         """Draws in [-1, 1]."""
         return distribution.sample(key, num)
 
-    def decode(self, space: ActionSpace, sample: Float[Array, "*B T G 4"]) -> Actions:
-        """Floor the index; scale the displacement."""
+    def decode(self, space: ActionSpace, sample: Float[Array, "*B T G 4"]) -> Plans:
+        """Floor the index."""
         count = len(space.candidates)
         index = jnp.floor((sample[..., 3] + 1.0) / 2.0 * (count + 1)).astype(int)
-        return space.actions(jnp.clip(index, 0, count), sample[..., :3])
+        return Plans(jnp.clip(index, 0, count), sample[..., :3])
+
+    def encode(self, space: ActionSpace, plans: Plans) -> Float[Array, "*B T G 4"]:
+        """The middle of the index's interval."""
+        index = (plans.choice + 0.5) / (len(space.candidates) + 1) * 2.0 - 1.0
+        return jnp.concatenate([plans.direction, index[..., None]], axis=-1)
 
     def update(
         self,
@@ -158,8 +138,20 @@ class ChoiceAndGaussian:
     displacement: Gaussian
 
 
+class ChoiceAndDirection:
+    """Encodings whose samples are plans."""
+
+    def decode(self, space: ActionSpace, sample: Plans) -> Plans:
+        """The sample itself."""
+        return sample
+
+    def encode(self, space: ActionSpace, plans: Plans) -> Plans:
+        """The plans themselves."""
+        return plans
+
+
 @dataclass(frozen=True)
-class Categorical:
+class Categorical(ChoiceAndDirection):
     """Elite frequencies over the candidates and None, and a Gaussian over displacements."""
 
     name: str = "categorical"
@@ -175,42 +167,34 @@ class Categorical:
 
     def sample(
         self, space: ActionSpace, distribution: ChoiceAndGaussian, key: PRNGKeyArray, num: int
-    ) -> tuple[Int[Array, "num T G"], Float[Array, "num T G 3"]]:
+    ) -> Plans:
         """Choices and displacements."""
         key_choice, key_move = jax.random.split(key)
         choice = _draw_choices(distribution.frequency, key_choice, num)
-        return choice, distribution.displacement.sample(key_move, num)
-
-    def decode(
-        self, space: ActionSpace, sample: tuple[Int[Array, "*B T G"], Float[Array, "*B T G 3"]]
-    ) -> Actions:
-        """Scale the displacement."""
-        return space.actions(*sample)
+        return Plans(choice, distribution.displacement.sample(key_move, num))
 
     def update(
         self,
         space: ActionSpace,
         distribution: ChoiceAndGaussian,
-        elites: tuple[Int[Array, "E T G"], Float[Array, "E T G 3"]],
+        elites: Plans,
         smoothing: float,
     ) -> ChoiceAndGaussian:
         """Frequencies and moments of the elites."""
-        choice, move = elites
+        choice, move = elites.choice, elites.direction
         counted = jax.nn.one_hot(choice, len(space.candidates) + 1).mean(axis=0)
         return ChoiceAndGaussian(
             _blend(distribution.frequency, counted, smoothing),
             distribution.displacement.update(move, smoothing),
         )
 
-    def mean(
-        self, space: ActionSpace, distribution: ChoiceAndGaussian
-    ) -> tuple[Int[Array, "T G"], Float[Array, "T G 3"]]:
+    def mean(self, space: ActionSpace, distribution: ChoiceAndGaussian) -> Plans:
         """The likeliest choices with the mean displacements."""
-        return distribution.frequency.argmax(axis=-1), distribution.displacement.mean
+        return Plans(distribution.frequency.argmax(axis=-1), distribution.displacement.mean)
 
 
 @dataclass(frozen=True)
-class Joint:
+class Joint(ChoiceAndDirection):
     """What is grasped and where it goes, together: a Gaussian for each candidate in each slot.
 
     A fold of several corners has many orders; under one Gaussian for all candidates of a slot (an
@@ -218,8 +202,8 @@ class Joint:
     displacement of another. Candidates with few elites borrow from all elites of the slot
     (shrinkage: `borrowed` counts as that many elites).
 
-    A search that has settled on some folds no longer tries others, so a share `fresh` of the slots
-    is drawn evenly from all choices and displacements, whatever the distribution (a defensive
+    A search that has settled on some folds no longer tries others, so a fraction `fresh` of the
+    slots is drawn evenly from all choices and displacements, whatever the distribution (a defensive
     mixture: Hesterberg, "Weighted average importance sampling and defensive mixture
     distributions", Technometrics, 1995).
     """
@@ -236,7 +220,7 @@ class Joint:
 
     def sample(
         self, space: ActionSpace, distribution: ChoiceAndGaussian, key: PRNGKeyArray, num: int
-    ) -> tuple[Int[Array, "num T G"], Float[Array, "num T G 3"]]:
+    ) -> Plans:
         """Choices, and displacements of the Gaussians chosen."""
         key_choice, key_move, key_fresh, key_any, key_anywhere = jax.random.split(key, 5)
         choice = _draw_choices(distribution.frequency, key_choice, num)
@@ -247,23 +231,17 @@ class Joint:
         anything = jax.random.randint(key_any, choice.shape, 0, len(space.candidates) + 1)
         anywhere = jax.random.uniform(key_anywhere, move.shape, minval=-1.0, maxval=1.0)
         choice = jnp.where(fresh, anything, choice)
-        return choice, jnp.where(fresh[..., None], anywhere, jnp.clip(move, -1.0, 1.0))
-
-    def decode(
-        self, space: ActionSpace, sample: tuple[Int[Array, "*B T G"], Float[Array, "*B T G 3"]]
-    ) -> Actions:
-        """Scale the displacement."""
-        return space.actions(*sample)
+        return Plans(choice, jnp.where(fresh[..., None], anywhere, jnp.clip(move, -1.0, 1.0)))
 
     def update(
         self,
         space: ActionSpace,
         distribution: ChoiceAndGaussian,
-        elites: tuple[Int[Array, "E T G"], Float[Array, "E T G 3"]],
+        elites: Plans,
         smoothing: float,
     ) -> ChoiceAndGaussian:
         """Frequencies of the elites, and moments of those that made each choice."""
-        choice, move = elites
+        choice, move = elites.choice, elites.direction
         chosen = jax.nn.one_hot(choice, len(space.candidates) + 1, dtype=move.dtype)
         count = chosen.sum(axis=0)[..., None]
 
@@ -282,12 +260,10 @@ class Joint:
             ),
         )
 
-    def mean(
-        self, space: ActionSpace, distribution: ChoiceAndGaussian
-    ) -> tuple[Int[Array, "T G"], Float[Array, "T G 3"]]:
+    def mean(self, space: ActionSpace, distribution: ChoiceAndGaussian) -> Plans:
         """The likeliest choices with their mean displacements."""
         choice = distribution.frequency.argmax(axis=-1)
-        return choice, _of_choice(distribution.displacement.mean, choice[None])[0]
+        return Plans(choice, _of_choice(distribution.displacement.mean, choice[None])[0])
 
 
 def _draw_choices(

@@ -1,51 +1,16 @@
-"""Results on disk: a folder that one configuration owns, rows that survive a kill, provenance."""
+"""Results on disk: a folder that one configuration owns, and JSON that is whole or absent."""
 
-import importlib.metadata
 import json
 import os
-import platform
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
-from jaxsimp.machine import num_cores
-
 CONFIG_FILE = "config.json"
-PACKAGES = (
-    "jaxsimp",
-    "jax",
-    "jaxlib",
-    "numpy",
-    "scipy",
-    "optax",
-    "libigl",
-    "proxsuite",
-    "mujoco",
-)
 
 
-class ResultsError(Exception):
+class ResultsError(ValueError):
     """A results folder cannot be used as asked; the message says why and what to do."""
-
-
-def environment() -> dict[str, Any]:
-    """What results depend on besides their configuration: versions, commit, device, cores."""
-    device = jax.devices()[0]
-    return {
-        "python": platform.python_version(),
-        "versions": {name: _version(name) for name in PACKAGES},
-        "commit": _commit(),
-        "platform": platform.platform(),
-        "processor": _processor(),
-        "cores": num_cores(),
-        "device": device.device_kind,
-        "num_devices": jax.device_count(),
-        "x64": jnp.result_type(float) == jnp.float64,
-    }
 
 
 def open_folder(folder: Path, config: Mapping[str, Any]) -> None:
@@ -102,54 +67,3 @@ def write_json(path: Path, value: object) -> None:
     part = path.with_name(path.name + ".part")
     part.write_text(json.dumps(value, indent=1) + "\n")
     os.replace(part, path)
-
-
-def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Add one line to a JSON-lines file and make sure that it is on the disk."""
-    with path.open("a") as file:
-        file.write(json.dumps(row) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a JSON-lines file; a last line cut short by a kill is removed from it."""
-    if not path.exists():
-        return []
-    whole, newline, rest = path.read_text().rpartition("\n")
-    if rest:
-        with path.open("r+") as file:
-            file.truncate(len((whole + newline).encode()))
-    return [json.loads(line) for line in whole.splitlines()]
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
-
-
-def _commit() -> str:
-    """The commit that the code is at, with `+changes` where files differ from it."""
-    root = Path(__file__).parent
-    git = ["git", "-C", str(root)]
-    try:
-        commit = subprocess.run(
-            [*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        status = subprocess.run(
-            [*git, "status", "--porcelain"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return commit + ("+changes" if status else "")
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor()

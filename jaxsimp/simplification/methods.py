@@ -6,6 +6,7 @@ from jaxtyping import Float
 from jaxsimp.bodies import Body
 from jaxsimp.goals import Positions, as_goal
 from jaxsimp.simplification.key_points import FitStatus, KeyPoints
+from jaxsimp.simplification.ropes.fit import Workspace, why_infeasible
 from jaxsimp.simplification.ropes.optimal import simplify_optimal
 from jaxsimp.simplification.ropes.uniform import simplify_uniform
 from jaxsimp.simplification.surfaces.meshlab import simplify_meshlab
@@ -27,6 +28,7 @@ def simplify_batch(
     method: str = "robust",
     tolerance: float | None = None,
     max_size: int | None = None,
+    workspace: Workspace | None = None,
 ) -> list[KeyPoints]:
     """Key points of a batch of goals: the smallest accurate model of each.
 
@@ -41,18 +43,28 @@ def simplify_batch(
             tool, an extra.
         tolerance: error below which a model fits, metres; the method's own by default.
         max_size: largest number of key points tried; the method's own by default.
+        workspace: limits that the model of a rope keeps to, metres; none by default. A goal
+            that has no model within them has the status `INFEASIBLE`.
 
     Raises:
-        ValueError: if there is no such method, a goal is not one of this body, or a number is
-            out of its range.
+        ValueError: if there is no such method, a goal is not one of this body, a number is
+            out of its range, or a workspace is given for a surface.
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}")
     checked = [as_goal(body, goal) for goal in goals]
+    simplify_ropes, simplify_surfaces = METHODS[method]
+    if workspace is not None and len(body.faces):
+        raise ValueError(
+            f"a workspace (lower, upper, above_table, fixed_ends, max_stretch) is given, and "
+            f"{body.name} is a surface of {len(body.faces)} triangles; only models of ropes keep "
+            f"to a workspace: leave it out"
+        )
     if not checked:
         return []
-    simplify_goals = METHODS[method][len(body.faces) > 0]
-    return simplify_goals(body, np.stack(checked), tolerance, max_size)
+    if len(body.faces):
+        return simplify_surfaces(body, np.stack(checked), tolerance, max_size)
+    return simplify_ropes(body, np.stack(checked), tolerance, max_size, workspace=workspace)
 
 
 def simplify(
@@ -62,6 +74,7 @@ def simplify(
     method: str = "robust",
     tolerance: float | None = None,
     max_size: int | None = None,
+    workspace: Workspace | None = None,
 ) -> KeyPoints:
     """Key points of one goal: its smallest accurate model (section III-A of the paper).
 
@@ -71,12 +84,17 @@ def simplify(
         method: as for `simplify_batch`.
         tolerance: error below which a model fits, metres; the method's own by default.
         max_size: largest number of key points tried; the method's own by default.
+        workspace: as for `simplify_batch`.
 
     Raises:
-        ValueError: as for `simplify_batch`, or if no model fits.
+        ValueError: as for `simplify_batch`, or if no model fits or none is within the workspace.
     """
     goals = np.asarray(goal)[None]
-    (points,) = simplify_batch(body, goals, method=method, tolerance=tolerance, max_size=max_size)
+    (points,) = simplify_batch(
+        body, goals, method=method, tolerance=tolerance, max_size=max_size, workspace=workspace
+    )
+    if points.status == FitStatus.INFEASIBLE:
+        raise ValueError(why_infeasible(body, goals[0], workspace or Workspace()))
     if points.status != FitStatus.FITS:
         raise ValueError(
             f"no model of up to {points.sizes[-1]} key points is within the tolerance of "

@@ -14,30 +14,30 @@ from jaxsimp.tasks import cloth
 from jaxsimp.tasks import garments
 
 # isort: split
-from jaxsimp.tasks.costs import distance_cost, matching_cost, matching_distance
-from jaxsimp.tasks.crumple import crumple
-from jaxsimp.tasks.task import (
-    CostFn,
-    Episode,
-    Task,
-    TaskFactory,
-    make_task,
-    register,
-    score,
-    task_names,
-)
+from jaxsimp.tasks.costs import MatchingCost, distance_cost, matching_distance
+from jaxsimp.tasks.crumpling import crumple
+from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
+from jaxsimp.tasks.registry import TaskFactory, make_task, register, task_names
+from jaxsimp.tasks.starts import CrumpledStart, FixedStart, TurnedStart
+from jaxsimp.tasks.task import Task, score
 
 __all__ = [
-    "CostFn",
+    "CrumpledStart",
+    "DrawFn",
     "Episode",
+    "EpisodeFn",
+    "FixedStart",
+    "MatchingCost",
+    "RunningCost",
     "Task",
     "TaskFactory",
+    "TerminalCost",
+    "TurnedStart",
     "cloth",
     "crumple",
     "distance_cost",
     "garments",
     "make_task",
-    "matching_cost",
     "matching_distance",
     "register",
     "rope",

@@ -1,117 +1,133 @@
 """Tasks of cloths: the two folds of the paper, after SoftGym and fabric-vsf, and more."""
 
+from dataclasses import dataclass
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
+from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.costs import distance, distance_cost
-from jaxsimp.tasks.task import Episode, Task, register
+from jaxsimp.tasks.episode import Episode
+from jaxsimp.tasks.registry import register
+from jaxsimp.tasks.starts import TurnedStart
+from jaxsimp.tasks.task import Task
 
 STILL_WEIGHT = 1.2
 """Weight of the displacement of the half that should lie still, after SoftGym."""
 
 
-@register("cloth_side_folding", full=25, quick=9, group="paper")
+@dataclass(frozen=True, eq=False)
+class FoldCost:
+    """Cost of a fold in half: `mean |a_i - b_i| + 1.2 mean |b_i - b_i(0)|`, metres.
+
+    `a` is the moving half and `b` its mirror image in the half that should lie still, as in
+    SoftGym.
+
+    Attributes:
+        moving: ids of the particles of the moving half, shape (M,).
+        still: ids of their mirror images, shape (M,).
+    """
+
+    moving: Int[np.ndarray, " M"]
+    still: Int[np.ndarray, " M"]
+
+    def __call__(
+        self, episode: Episode, state: State, action: Actions | None = None
+    ) -> Float[Array, ""]:
+        """The cost of a state, metres."""
+        position = state.position
+        apart = distance(position[self.moving] - position[self.still]).mean()
+        start = jnp.asarray(episode.start)[self.still]
+        dragged = distance(position[self.still] - start).mean()
+        return apart + STILL_WEIGHT * dragged
+
+
+@register(full=25, quick=9, group="paper")
 def cloth_side_folding(resolution: int) -> Task:
     """Fold a square cloth in half sideways."""
     body = cloth((resolution, resolution))
     row, column = np.divmod(np.arange(resolution**2), resolution)
     moving = np.flatnonzero(2 * row <= resolution - 1)
     mirror = (resolution - 1 - row) * resolution + column
-    return _fold_task("cloth_side_folding", body, (0.0, 1.0), moving, mirror)
+    return _fold_task(body, (0.0, 1.0), moving, mirror)
 
 
-@register("cloth_diagonal_folding", full=25, quick=9, group="paper")
+@register(full=25, quick=9, group="paper")
 def cloth_diagonal_folding(resolution: int) -> Task:
     """Fold a square cloth along its diagonal."""
     body = cloth((resolution, resolution))
     row, column = np.divmod(np.arange(resolution**2), resolution)
     moving = np.flatnonzero(row + column <= resolution - 1)
     mirror = (resolution - 1 - column) * resolution + (resolution - 1 - row)
-    return _fold_task("cloth_diagonal_folding", body, (-1.0, 1.0), moving, mirror)
+    return _fold_task(body, (-1.0, 1.0), moving, mirror)
 
 
 def _fold_task(
-    name: str, body: Body, direction: tuple[float, float], moving: np.ndarray, mirror: np.ndarray
+    body: Body, direction: tuple[float, float], moving: np.ndarray, mirror: np.ndarray
 ) -> Task:
-    """A fold about a line through the middle.
+    """A fold about a line through the middle, from a flat start turned at random (see `FoldCost`).
 
-    The cost is `mean |a_i - b_i| + 1.2 mean |b_i - b_i(0)|`, with `a` the moving half and `b`
-    its mirror image in the half that should lie still. The start is flat, turned at random
-    within 45 degrees, as in SoftGym.
+    Args:
+        body: a square cloth.
+        direction: x and y of the line's direction.
+        moving: ids of the particles of the moving half, shape (M,).
+        mirror: id of the mirror image of each particle, shape (N,).
     """
-    still = mirror[moving]
-    line = np.zeros(2), np.array(direction)
-
-    def cost(episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-        apart = distance(position[moving] - position[still]).mean()
-        dragged = distance(position[still] - jnp.asarray(episode.start)[still]).mean()
-        return apart + STILL_WEIGHT * dragged
-
-    def episode(seed: int) -> Episode:
-        angle = random_angle(seed)
-        return Episode(goals.flat(body, angle), goals.turn(goal, angle))
-
-    goal = goals.fold(body, goals.flat(body), *line)
+    goal = goals.fold(body, goals.flat(body), np.zeros(2), np.array(direction))
+    start, cost = TurnedStart(body, goal), FoldCost(moving, mirror[moving])
     return Task(
-        name=name,
         body=body,
         goal=goal,
-        episode_fn=episode,
-        cost_fn=cost,
+        episode_fn=start,
+        draw_fn=start.draw,
+        running_cost=cost,
+        terminal_cost=cost,
         limits=(0.2, 0.2, 0.2),
         num_actions=2,
         action_seconds=0.25,
     )
 
 
-@register("cloth_letter_fold", full=25, quick=9, group="goals")
+@register(full=25, quick=9, group="goals")
 def cloth_letter_fold(resolution: int) -> Task:
     """Fold a square cloth in thirds, like a letter."""
-    return _folds_task("cloth_letter_fold", cloth((resolution, resolution)), "letter", 6)
+    return _folds_task(cloth((resolution, resolution)), "letter", 6)
 
 
-@register("cloth_quarter_fold", full=25, quick=9, group="goals")
+@register(full=25, quick=9, group="goals")
 def cloth_quarter_fold(resolution: int) -> Task:
     """Fold a square cloth in half, and again."""
-    return _folds_task("cloth_quarter_fold", cloth((resolution, resolution)), "quarter", 6)
+    return _folds_task(cloth((resolution, resolution)), "quarter", 6)
 
 
-@register("cloth_four_corners", full=25, quick=9, group="goals")
+@register(full=25, quick=9, group="goals")
 def cloth_four_corners(resolution: int) -> Task:
     """Fold the four corners of a square cloth to its centre."""
-    return _folds_task("cloth_four_corners", cloth((resolution, resolution)), "four_corners", 6)
+    return _folds_task(cloth((resolution, resolution)), "four_corners", 6)
 
 
-def _folds_task(name: str, body: Body, folds: str, num_actions: int) -> Task:
+def _folds_task(body: Body, folds: str, num_actions: int) -> Task:
     goal = goals.fold_sequence(body, goals.rectangle_folds(body, folds))
-    return flat_task(name, body, goal, num_actions)
+    return flat_task(body, goal, num_actions)
 
 
-def flat_task(name: str, body: Body, goal: goals.Positions, num_actions: int) -> Task:
+def flat_task(body: Body, goal: goals.Positions, num_actions: int) -> Task:
     """A goal from a flat start that is turned at random within 45 degrees.
 
     The cost is the mean distance of the particles to their goals.
     """
-
-    def episode(seed: int) -> Episode:
-        angle = random_angle(seed)
-        return Episode(goals.flat(body, angle), goals.turn(goal, angle))
-
+    start = TurnedStart(body, goal)
     return Task(
-        name=name,
         body=body,
         goal=goal,
-        episode_fn=episode,
-        cost_fn=distance_cost,
+        episode_fn=start,
+        draw_fn=start.draw,
+        running_cost=distance_cost,
+        terminal_cost=distance_cost,
         limits=(0.2, 0.2, 0.2),
         num_actions=num_actions,
         action_seconds=0.25,
     )
-
-
-def random_angle(seed: int) -> float:
-    """Of a flat start, radians, within 45 degrees, as in SoftGym."""
-    return np.random.default_rng(seed).uniform(-np.pi / 4, np.pi / 4)

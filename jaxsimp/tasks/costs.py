@@ -1,33 +1,54 @@
-"""Costs that tasks share: distances that are differentiable everywhere."""
+"""Costs that tasks share: distances that are differentiable everywhere.
+
+A cost of positions ignores the action: it serves as the running and as the terminal cost of a task.
+"""
+
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxsimp.tasks.task import CostFn, Episode
+from jaxsimp.dynamics import Actions, State
+from jaxsimp.tasks.episode import Episode
+
+MATCHED_PARTICLES = 11
+"""Number of particles that `MatchingCost` compares; SoftGym chooses 10."""
 
 
-def matching_cost(num_particles: int) -> CostFn:
+def distance_cost(
+    episode: Episode, state: State, action: Actions | None = None
+) -> Float[Array, ""]:
+    """Mean distance of the particles to their goals, metres."""
+    return distance(state.position - jnp.asarray(episode.goal)).mean()
+
+
+@dataclass(frozen=True)
+class MatchingCost:
     """SoftGym's bipartite matching distance between 11 particles, evenly chosen, and their goals.
 
-    The mean distance in the best assignment, metres. SoftGym chooses 10.
+    The mean distance in the best assignment, metres.
 
-    Args:
-        num_particles: of the body.
+    Attributes:
+        num_particles: number of particles of the body, `N`.
     """
-    chosen = np.unique(np.round(np.linspace(0, num_particles - 1, 11)).astype(int))
 
-    def cost(episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-        return matching_distance(position[chosen], jnp.asarray(episode.goal)[chosen])
+    num_particles: int
 
-    return cost
+    def __call__(
+        self, episode: Episode, state: State, action: Actions | None = None
+    ) -> Float[Array, ""]:
+        """The cost of a state, metres."""
+        chosen = self.chosen
+        return matching_distance(state.position[chosen], jnp.asarray(episode.goal)[chosen])
 
-
-def distance_cost(episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-    """Mean distance of the particles to their goals, metres."""
-    return distance(position - jnp.asarray(episode.goal)).mean()
+    @property
+    def chosen(self) -> Int[np.ndarray, " M"]:
+        """Ids of the particles that are compared."""
+        evenly = np.linspace(0, self.num_particles - 1, MATCHED_PARTICLES)
+        return np.unique(np.round(evenly).astype(int))
 
 
 def matching_distance(

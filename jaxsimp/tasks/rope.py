@@ -6,9 +6,12 @@ from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body, rope
-from jaxsimp.tasks.costs import distance, distance_cost, matching_cost
-from jaxsimp.tasks.crumple import crumple
-from jaxsimp.tasks.task import Episode, Task, register
+from jaxsimp.dynamics import Actions, State
+from jaxsimp.tasks.costs import MatchingCost, distance, distance_cost
+from jaxsimp.tasks.episode import Episode
+from jaxsimp.tasks.registry import register
+from jaxsimp.tasks.starts import CrumpledStart, FixedStart
+from jaxsimp.tasks.task import Task
 
 ROPE_LENGTH = 0.5375
 """Rest length of SoftGym's rope, metres; the straight goal is `SLACK` of it long."""
@@ -17,31 +20,35 @@ ROPE_LIMITS = (0.15, 0.15, 0.15)
 """Largest displacement of one action along x, y, z, metres."""
 
 
-@register("rope_straightening", full=41, quick=21, group="paper")
-def rope_straightening(resolution: int) -> Task:
-    """Pull a crumpled rope straight: cost `abs(|p_1 - p_N| - L)`, as in SoftGym.
+def ends_cost(episode: Episode, state: State, action: Actions | None = None) -> Float[Array, ""]:
+    """Difference, metres, between the distance of a rope's ends and their distance in the goal.
 
-    `L` is the length of the slack straight goal; the start is a straight rope after four
-    random picks (see `crumple`).
+    `abs(|p_1 - p_N| - L)`, with `L` the distance of the ends in the goal, as in SoftGym.
+    """
+    position, goal = state.position, jnp.asarray(episode.goal)
+    return jnp.abs(distance(position[0] - position[-1]) - distance(goal[0] - goal[-1]))
+
+
+@register(full=41, quick=21, group="paper")
+def rope_straightening(resolution: int) -> Task:
+    """Pull a crumpled rope straight, as in SoftGym; the goal is slack.
+
+    The start is a straight rope after four random picks (see `crumple`); the cost is `ends_cost`.
     """
     body = rope(resolution, ROPE_LENGTH)
     goal = goals.straight(body, SLACK * body.size)
 
-    def cost(episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-        goal = jnp.asarray(episode.goal)
-        return jnp.abs(distance(position[0] - position[-1]) - distance(goal[0] - goal[-1]))
-
     return Task(
-        name="rope_straightening",
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=lambda seed: Episode(crumple(body, seed), goal),
-        cost_fn=cost,
+        episode_fn=CrumpledStart(body, goal),
+        running_cost=ends_cost,
+        terminal_cost=ends_cost,
     )
 
 
-@register("rope_folding", full=41, quick=21, group="paper")
+@register(full=41, quick=21, group="paper")
 def rope_folding(resolution: int) -> Task:
     """Lay a straight rope along two sides of an equilateral triangle, its corner at the middle.
 
@@ -53,48 +60,49 @@ def rope_folding(resolution: int) -> Task:
     height = np.sqrt(3) / 2 * side
     corners = np.array([[-side / 2, -height / 2], [0.0, height / 2], [side / 2, -height / 2]])
     goal = goals.polyline(body, corners)
-    start = goals.straight(body)
-
+    start, cost = FixedStart(Episode(goals.straight(body), goal)), MatchingCost(resolution)
     return Task(
-        name="rope_folding",
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=lambda seed: Episode(start, goal),
-        cost_fn=matching_cost(resolution),
+        episode_fn=start,
+        draw_fn=start.draw,
+        running_cost=cost,
+        terminal_cost=cost,
     )
 
 
-@register("rope_letter_m", full=41, quick=21, group="goals")
+@register(full=41, quick=21, group="goals")
 def rope_letter_m(resolution: int) -> Task:
     """Lay a straight rope as an M."""
     body = rope(resolution, ROPE_LENGTH)
-    return _shape_task("rope_letter_m", body, goals.letter(body, "M"))
+    return _shape_task(body, goals.letter(body, "M"))
 
 
-@register("rope_letter_u", full=41, quick=21, group="goals")
+@register(full=41, quick=21, group="goals")
 def rope_letter_u(resolution: int) -> Task:
     """Lay a straight rope as a U, its bow round."""
     body = rope(resolution, ROPE_LENGTH)
-    return _shape_task("rope_letter_u", body, goals.letter(body, "U"))
+    return _shape_task(body, goals.letter(body, "U"))
 
 
-@register("rope_crossed_triangle", full=41, quick=21, group="goals")
+@register(full=41, quick=21, group="goals")
 def rope_crossed_triangle(resolution: int) -> Task:
     """Lay a straight rope as a triangle whose two ends cross and go on."""
     body = rope(resolution, ROPE_LENGTH)
-    return _shape_task("rope_crossed_triangle", body, goals.crossed_triangle(body))
+    return _shape_task(body, goals.crossed_triangle(body))
 
 
-def _shape_task(name: str, body: Body, goal: goals.Positions) -> Task:
+def _shape_task(body: Body, goal: goals.Positions) -> Task:
     """A goal from a straight start; the cost is the mean distance of particles to their goals."""
-    start = goals.straight(body)
+    start = FixedStart(Episode(goals.straight(body), goal))
     return Task(
-        name=name,
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=lambda seed: Episode(start, goal),
-        cost_fn=distance_cost,
+        episode_fn=start,
+        draw_fn=start.draw,
+        running_cost=distance_cost,
+        terminal_cost=distance_cost,
         num_actions=6,
     )

@@ -1,36 +1,24 @@
-"""What a task is, how states are scored, and the registry of tasks."""
+"""What a task is, and how states are scored."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
 from jaxsimp.dynamics import (
     Pickers,
     Simulation,
+    State,
+    at_rest,
     largest_time_step,
     make_pickers,
     make_simulation,
 )
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
-@dataclass(frozen=True)
-class Episode:
-    """Where one run starts and where it should end: positions, shape (N, 3), metres."""
-
-    start: Float[Array | np.ndarray, "N 3"]
-    goal: Float[Array | np.ndarray, "N 3"]
-
-
-CostFn = Callable[[Episode, Float[Array, "N 3"]], Float[Array, ""]]
-"""Cost of positions in an episode; pure JAX."""
+from jaxsimp.tasks.check import check_costs, check_count, check_draw, check_limits, check_seconds
+from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +26,12 @@ class Task:
     """What is asked of a planner.
 
     Attributes:
-        name: in the registry.
         body: what is manipulated.
         goal: the goal configuration that key points are found in, shape (N, 3), metres.
         episode_fn: from a seed to start and goal.
-        cost_fn: cost of positions in an episode, a scalar; pure JAX.
+        running_cost: cost of an episode, the state at the end of an action, and that action,
+            shapes (G,) and (G, 3): a scalar, at least 0; pure JAX.
+        terminal_cost: cost of an episode and the settled state: a scalar, at least 0; pure JAX.
         limits: largest displacement of one action along x, y, z, metres.
         num_actions: actions in a plan, `T`.
         num_pickers: `G`.
@@ -50,22 +39,58 @@ class Task:
         settle_actions: as many times `action_seconds` pass, with nothing held, after the
             last action and before the plan is scored.
         longest_time_step: bound on the time step of the simulation, seconds.
+        draw_fn: from a key to start and goal, pure JAX; None where starts are made by seed only.
+        name: of a registered task that of its factory, see `register`.
+        resolution: that a registered task was made with, see `make_task`; None of another one.
+
+    Raises:
+        ValueError: if the goal is refused (see `goals.check_goal`), a number is out of its range,
+            a cost cannot be compiled or is no float scalar, or `draw_fn` draws no episode of
+            the body.
     """
 
-    name: str
     body: Body
     goal: Float[np.ndarray, "N 3"]
-    episode_fn: Callable[[int], Episode]
-    cost_fn: CostFn
+    episode_fn: EpisodeFn
+    running_cost: RunningCost
+    terminal_cost: TerminalCost
     limits: tuple[float, float, float]
     num_actions: int = 4
     num_pickers: int = 2
     action_seconds: float = 0.3
     settle_actions: int = 4
     longest_time_step: float = 2e-3
+    draw_fn: DrawFn | None = None
+    name: str = "unnamed"
+    resolution: int | None = None
 
     def __post_init__(self) -> None:
         goals.check_goal(self.body, self.goal)
+        check_limits(self.limits)
+        for name, least in (("num_actions", 1), ("num_pickers", 1), ("settle_actions", 0)):
+            check_count(name, getattr(self, name), least)
+        for name in ("action_seconds", "longest_time_step"):
+            check_seconds(name, getattr(self, name))
+        check_costs(
+            self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
+        )
+        if self.draw_fn is not None:
+            check_draw(self.draw_fn, self.body.num_particles)
+
+    def draw_episode(self, key: PRNGKeyArray) -> Episode:
+        """A random episode, drawn by a key: pure JAX, to which `jit` and `vmap` over keys apply.
+
+        The starts are as those of `episode_fn`; the start of no key is that of a seed.
+
+        Raises:
+            ValueError: if the starts of this task are made by seed only.
+        """
+        if self.draw_fn is None:
+            raise ValueError(
+                f"the task {self.name!r} has no draw_fn, as its starts may need a simulation; use "
+                f"episode_fn(seed), or give the task a draw_fn"
+            )
+        return self.draw_fn(key)
 
     def simulation(self, *, self_contact: bool = False) -> Simulation:
         """The body's simulation, at the task's time step.
@@ -100,63 +125,24 @@ class Task:
         return round(self.action_seconds / self.time_step)
 
 
-def score(task: Task, episode: Episode, position: Float[Array, "N 3"]) -> Float[Array, ""]:
-    """Normalised score `(c_0 - c) / c_0`: 1 at the goal, 0 for a state as good as the start."""
-    start = task.cost_fn(episode, jnp.asarray(episode.start))
-    return (start - task.cost_fn(episode, position)) / start
+def score(
+    task: Task, episode: Episode, state: State | Float[Array | np.ndarray, "N 3"]
+) -> Float[Array, ""]:
+    """Normalised score `(c_0 - c) / c_0`: 1 where the cost is 0, 0 where it is that of the start.
 
-
-TaskFactory = Callable[[int], Task]
-
-_REGISTRY: dict[str, tuple[TaskFactory, int, int, str]] = {}
-
-
-def register(
-    name: str, *, full: int, quick: int, group: str = "others"
-) -> Callable[[TaskFactory], TaskFactory]:
-    """Add a task to the registry under a name.
+    `c_0` and `c` are terminal costs of the start, at rest, and of the state. Of a start that costs
+    nothing the score is the limit of small `c_0`: 1 where `c` is 0, too, and minus infinity where
+    it is more. The score is not a number only where a cost is none.
 
     Args:
-        name: of the task.
-        full: resolution of the task as it is studied.
-        quick: resolution for tests and smoke runs.
-        group: of tasks that are studied together: "paper" or "goals" here.
-
-    Raises:
-        ValueError: if the name is taken.
+        task: what is asked.
+        episode: start and goal.
+        state: that is scored, or its positions, shape (N, 3), metres, at rest.
     """
-    if name in _REGISTRY:
-        raise ValueError(f"task {name!r} is registered already; choose another name")
-
-    def add(factory: TaskFactory) -> TaskFactory:
-        _REGISTRY[name] = (factory, full, quick, group)
-        return factory
-
-    return add
-
-
-def task_names(group: str | None = None) -> tuple[str, ...]:
-    """Names of the registered tasks of a group, or of all."""
-    return tuple(name for name, entry in _REGISTRY.items() if group in (None, entry[3]))
-
-
-def make_task(name: str, resolution: int | None = None, *, quick: bool = False) -> Task:
-    """A registered task.
-
-    Args:
-        name: one of `task_names()`.
-        resolution: particles along the rope or along a side of the cloth; a garment has its
-            square of them. By default that of the full or the quick scale.
-        quick: which of the two scales is the default.
-
-    Raises:
-        ValueError: if there is no such task, or the resolution is too low for it.
-    """
-    if name not in _REGISTRY:
-        raise ValueError(f"unknown task {name!r}; choose from {', '.join(_REGISTRY)}")
-    factory, full, small, _ = _REGISTRY[name]
-    if resolution is None:
-        resolution = small if quick else full
-    if resolution < 5:
-        raise ValueError(f"resolution is {resolution}; a task needs at least 5 particles a side")
-    return factory(resolution)
+    state = state if isinstance(state, State) else at_rest(state)
+    start = task.terminal_cost(episode, at_rest(episode.start))
+    cost = task.terminal_cost(episode, state)
+    relative = start != 0
+    ratio = (start - cost) / jnp.where(relative, start, 1.0)
+    of_free_start = jnp.where(cost > 0, -jnp.inf, 1.0 - cost)  # not a number where the cost is none
+    return jnp.where(relative, ratio, of_free_start)

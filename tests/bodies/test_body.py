@@ -1,5 +1,7 @@
 """Bodies: what they are made of, counted and measured in closed form, and what they refuse."""
 
+import copy
+import pickle
 from dataclasses import replace
 from itertools import combinations
 
@@ -10,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.bodies import Body, cloth, from_mesh, rope, rope_along
+from jaxsimp.bodies import Body, cloth, from_mesh, rope, rope_along, towel
 from jaxsimp.bodies.meshes import face_areas
 from jaxsimp.bodies.outlines import mesh_outline
 from jaxsimp.dynamics import (
@@ -142,6 +144,8 @@ def test_a_rope_along_points_refuses_too_few_and_coinciding_ones():
         rope_along(np.zeros((1, 3)))
     with pytest.raises(ValueError, match="rest_length is 0"):
         rope_along(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="points has a value that is not finite"):
+        rope_along(np.array([[0.0, 0.0, 0.0], [0.1, np.nan, 0.0]]))
 
 
 # --- meshes --------------------------------------------------------------------------------------
@@ -279,7 +283,7 @@ def test_a_picker_carries_a_mesh():
         ({"stretch_stiffness": -1.0}, "stiffness is -"),
         ({"damping": -1.0}, "damping is -"),
         ({"friction": -1.0}, "friction is -1"),
-        ({"radius": float("inf")}, "radius is inf"),
+        ({"thickness": float("inf")}, "thickness is inf"),
         ({"scale": 0.0}, "scale is 0.0; give the metres in one unit"),
         ({"scale": 1000.0}, "the mesh is 400 m large"),
     ],
@@ -289,11 +293,45 @@ def test_from_mesh_refuses(arguments, message):
         from_mesh(*mesh_outline(STRIP, 60), **arguments)
 
 
-def test_arrays_are_read_only():
+ARRAYS = ("rest", "mass", "springs", "families", "rest_length", "stiffness", "damping", "faces")
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda body: body,
+        lambda body: pickle.loads(pickle.dumps(body)),
+        copy.copy,
+        copy.deepcopy,
+        lambda body: replace(body, name="other"),
+        lambda body: body.scaled(drag=2.0),
+    ],
+    ids=["made", "pickled", "copied", "copied deeply", "replaced", "scaled"],
+)
+def test_arrays_are_read_only_and_the_body_s_own(made):
     body = cloth((3, 3))
-    for name in ("rest", "mass", "springs", "rest_length", "stiffness", "damping", "faces"):
+    found = made(body)
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(body, name))
+        assert getattr(found, name).dtype == getattr(body, name).dtype
         with pytest.raises(ValueError, match="read-only"):
-            getattr(body, name)[0] = 0
+            getattr(found, name)[0] = 0
+        assert getattr(found, name).base is None  # which could be written to
+
+
+def test_a_pickled_body_is_the_same():
+    body = towel(num_particles=60, drag=2.5).body
+    found = pickle.loads(pickle.dumps(body))
+    assert (found.name, found.material, found.shape) == (body.name, body.material, body.shape)
+
+
+def test_arrays_of_the_caller_stay_writable_and_apart():
+    given = {name: np.array(getattr(cloth((3, 3)), name)) for name in ARRAYS}
+    body = replace(cloth((3, 3)), **given)
+    for name, array in given.items():
+        before = getattr(body, name).copy()
+        array[...] = 7
+        np.testing.assert_array_equal(getattr(body, name), before)
 
 
 def test_one_particle_without_springs_is_a_body():
@@ -302,6 +340,7 @@ def test_one_particle_without_springs_is_a_body():
         rest=np.zeros((1, 3)),
         mass=np.ones(1),
         springs=np.zeros((0, 2), dtype=int),
+        families=np.zeros(0, dtype=int),
         rest_length=np.zeros(0),
         stiffness=np.zeros(0),
         damping=np.zeros(0),
@@ -326,15 +365,16 @@ NAN, INF = float("nan"), float("inf")
         ({"mass": -1.0}, "mass is -1"),
         ({"mass": NAN}, "mass is nan"),
         ({"stretch_stiffness": -3.0}, "stiffness is -3; give a finite number, zero or more"),
-        ({"bend_stiffness": NAN}, "stiffness has a value that is not finite"),
+        ({"bend_stiffness": NAN}, "bend_stiffness is nan; give a finite number, zero or more"),
         ({"damping": -0.1}, "damping is -0.1"),
         ({"drag": -1.0}, "drag is -1"),
         ({"drag": INF}, "drag is inf"),
         ({"friction": -0.5}, "friction is -0.5"),
         ({"friction": NAN}, "friction is nan"),
         ({"friction": INF}, "friction is inf"),
-        ({"radius": -0.1}, "radius is -0.1"),
-        ({"radius": INF}, "radius is inf"),
+        ({"thickness": -0.1}, "thickness is -0.1"),
+        ({"thickness": INF}, "thickness is inf"),
+        ({"shear_stiffness": 1.0}, "shear_stiffness is 1; a rope has no shear springs: give 0"),
     ],
 )
 def test_a_rope_refuses(arguments, message):
@@ -352,7 +392,7 @@ def test_a_rope_refuses(arguments, message):
         ({"size": (0.3, INF)}, "size is inf"),
         ({"mass": -1.0}, "mass is -1"),
         ({"shear_stiffness": -3.0}, "stiffness is -3"),
-        ({"stretch_stiffness": INF}, "stiffness has a value that is not finite"),
+        ({"stretch_stiffness": INF}, "stretch_stiffness is inf"),
     ],
 )
 def test_a_cloth_refuses(arguments, message):
@@ -375,6 +415,9 @@ def test_a_cloth_refuses(arguments, message):
         ({"springs": np.array([[0, 1], [1, 2], [0, -1]])}, "springs names particle -1"),
         ({"springs": np.array([[0, 1], [1, 2], [2, 2]])}, r"spring \[2, 2\] joins a particle to"),
         ({"springs": np.array([[0, 1], [1, 2], [1, 0]])}, r"spring \[0, 1\] is there twice"),
+        ({"families": np.zeros(2, dtype=int)}, r"families has shape \(2,\); \(3,\) is needed"),
+        ({"families": np.array([0, 3, 0])}, "families is 3 for spring 1; give 0 for stretch"),
+        ({"families": np.array([0, 0, -1])}, "families is -1 for spring 2"),
         ({"rest_length": np.ones(2)}, r"rest_length has shape \(2,\); \(3,\) is needed"),
         ({"rest_length": np.array([0.0, 1.0, 1.0])}, "rest_length is 0"),
         ({"stiffness": np.array([1.0, -2.0, 1.0])}, "stiffness is -2"),

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.bodies.garments import DENSITY, skirt, t_shirt, towel, trousers
+from jaxsimp.bodies import MATERIALS
+from jaxsimp.bodies.garments import skirt, t_shirt, towel, trousers
 from jaxsimp.bodies.meshes import face_areas
 from jaxsimp.dynamics import at_rest, largest_time_step, make_simulation, settle
 
@@ -49,7 +50,7 @@ def test_landmarks_have_mirror_images_and_the_right_side_is_at_higher_x(make):
 def test_usual_garments_are_light_even_and_stable_at_a_millisecond(make):
     body = make().body
     area = face_areas(body.rest, body.faces).sum()
-    np.testing.assert_allclose(body.mass.sum(), DENSITY * area, rtol=1e-12)
+    np.testing.assert_allclose(body.mass.sum(), MATERIALS["garment"].density * area, rtol=1e-12)
     assert largest_time_step(body) >= 1e-3
     # The shortest spring is not far below the side of an equilateral triangle of this density.
     assert body.spacing > 0.5 * np.sqrt(area / body.num_particles * 2 / np.sqrt(3))

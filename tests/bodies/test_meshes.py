@@ -12,10 +12,8 @@ from scipy.spatial import cKDTree
 
 from jaxsimp.bodies import cloth
 from jaxsimp.bodies.meshes import (
-    boundary_edges,
     clean_mesh,
     face_areas,
-    half_edges,
     load_mesh,
     read_mesh,
     spring_weights,
@@ -327,24 +325,9 @@ def test_a_scale_that_is_none_is_refused(scale):
 
 
 @given(rows=st.integers(2, 6), columns=st.integers(2, 6))
-def test_the_boundary_of_a_grid_is_its_perimeter(rows, columns):
+def test_the_triangles_of_a_grid_have_half_a_cell_each(rows, columns):
     points, faces = grid_mesh(rows, columns)
-    edges = boundary_edges(faces)
-    ids = np.arange(rows * columns).reshape(rows, columns)
-    ring = [*ids[:-1, 0], *ids[-1, :-1], *ids[:0:-1, -1], *ids[0, :0:-1]]
-    # Counter-clockwise triangles have the inside to the left of their boundary.
-    assert set(map(tuple, edges.tolist())) == set(zip(ring, [*ring[1:], ring[0]], strict=True))
     np.testing.assert_allclose(face_areas(points, faces), 0.005, rtol=1e-12)
-
-
-def test_a_closed_surface_has_no_boundary():
-    assert len(boundary_edges(closed_mesh(0)[1])) == 0
-
-
-def test_half_edges_go_with_the_corner_that_they_leave_out():
-    edges, opposite = half_edges(np.array([[3, 5, 7], [7, 5, 9]]))
-    assert edges.tolist() == [[3, 5], [7, 5], [5, 7], [5, 9], [7, 3], [9, 7]]
-    assert opposite.tolist() == [7, 9, 3, 7, 5, 5]
 
 
 def energy(points, springs, weights, strain) -> float:

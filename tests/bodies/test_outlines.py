@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsimp.bodies import cloth
-from jaxsimp.bodies.meshes import boundary_edges, clean_mesh, face_areas
+from jaxsimp.bodies.meshes import clean_mesh, face_areas
 from jaxsimp.bodies.outlines import check_outline, mesh_outline, mesh_symmetric_outline, remesh
+from jaxsimp.bodies.topology import boundary_edges
 
 SQUARE = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]])
 ELL = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.15], [0.15, 0.15], [0.15, 0.5], [0.0, 0.5]])
@@ -45,7 +46,7 @@ def check_mesh(corners, points, faces, wanted):
     # Areas that add up to that of the outline, and one boundary as long as it: no holes, no
     # overlaps, nothing outside.
     np.testing.assert_allclose(face_areas(points, faces).sum(), shoelace(corners), rtol=1e-9)
-    edges = boundary_edges(faces)
+    edges = boundary_edges(faces)[0]
     around = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
     np.testing.assert_allclose(around.sum(), sides.sum(), rtol=1e-9)
@@ -75,7 +76,7 @@ def test_any_outline_is_filled(corners, wanted):
 
 def test_points_are_spread_evenly_on_the_sides():
     points, faces = mesh_outline(ELL, 300)
-    boundary = points[np.unique(boundary_edges(faces)), :2]
+    boundary = points[np.unique(boundary_edges(faces)[0]), :2]
     side = np.sort(boundary[boundary[:, 0] == 0, 1])
     np.testing.assert_allclose(np.diff(side), side[-1] / (len(side) - 1), rtol=1e-9)
     assert side[-1] == 0.5
@@ -154,7 +155,7 @@ def test_a_round_outline_is_followed():
     angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     disc = 0.3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points, faces = remesh(*mesh_outline(disc, 1200), 500)
-    boundary = np.unique(boundary_edges(faces))
+    boundary = np.unique(boundary_edges(faces)[0])
     # A thousandth of the extent of 0.6 m lies between the outline and its polygon.
     assert len(boundary) < 120
     assert face_areas(points, faces).sum() > np.pi * (0.3 - 0.0006) ** 2

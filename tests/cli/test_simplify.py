@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 import trimesh
 
+import jaxsimp
 from jaxsimp import goals
 from jaxsimp.bodies import cloth, rope
 from jaxsimp.cli import simplify
-from jaxsimp.simplification import simplify_batch
+from jaxsimp.cli.main import main
+from jaxsimp.simplification import Workspace, simplify_batch
 
 ROOT = Path(__file__).parents[2]
 ROPE, CLOTH = rope(), cloth()
@@ -48,10 +50,8 @@ SCHEMA = {
 
 
 def command(*options):
-    """What `python -m jaxsimp.cli.simplify` does, without another process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["jaxsimp.cli.simplify", *map(str, options)])
-        return simplify.main()
+    """What `jaxsimp simplify` does, without another process."""
+    return main(["simplify", *map(str, options)])
 
 
 def save(path, **arrays):
@@ -168,6 +168,56 @@ def test_sizes_without_a_model_are_null():
     assert found["errors"] == {"2": None, "3": 0.0}
 
 
+# --- workspaces ----------------------------------------------------------------------------------
+
+
+def test_a_workspace_is_that_of_the_library(tmp_path, result):
+    goal = LETTERS["V"] + [0.0, 0.1, -0.002]
+    path = save(tmp_path / "low.npz", positions=goal, rest=ROPE.rest)
+    limits = ("--lower", "-inf", "0.11", "-1", "--upper", "0.14", "inf", "inf")
+    status, found = result(
+        path, "--tolerance", 0.02, "--above-table", "--max-stretch", 0.05, *limits
+    )
+    workspace = Workspace(
+        lower=(-np.inf, 0.11, -1.0),
+        upper=(0.14, np.inf, np.inf),
+        above_table=True,
+        max_stretch=0.05,
+    )
+    (model,) = simplify_batch(ROPE, goal[None], tolerance=0.02, workspace=workspace)
+    assert (status, found["status"]) == (0, "FITS")
+    assert found["positions"] == model.positions.tolist()
+    assert min(z for _, _, z in found["positions"]) == pytest.approx(ROPE.radius, abs=1e-7)
+    assert min(y for _, y, _ in found["positions"]) == pytest.approx(0.11, abs=1e-7)
+    assert max(x for x, _, _ in found["positions"]) <= 0.14 + 1e-7
+
+
+def test_ends_are_fixed(letters, result):
+    goal = LETTERS["M"]
+    _, found = result(letters[1], "--fixed-ends")
+    np.testing.assert_allclose(np.array(found["positions"])[[0, -1]], goal[[0, -1]], atol=1e-7)
+    assert np.abs(np.array(result(letters[1])[1]["positions"])[0] - goal[0]).max() > 1e-5
+
+
+def test_a_goal_that_no_workspace_holds_is_infeasible(letters, result, tmp_path, capsys):
+    picture = tmp_path / "goal.png"
+    options = ("--fixed-ends", "--upper", "1", "0.01", "1", "--figure", picture)
+    status, found = result(letters[0], *options)
+    assert picture.stat().st_size > 10_000
+    assert status == 1
+    assert found.keys() == SCHEMA.keys()
+    assert found["status"] == "INFEASIBLE"
+    assert (found["key_points"], found["positions"], found["errors"]) == ([], [], {})
+    assert (found["max_error"], found["rms_error"], found["certified"]) == (None, None, False)
+    assert "INFEASIBLE" in capsys.readouterr().out
+
+
+def test_a_workspace_of_a_surface_is_refused(diagonal, tmp_path, capsys):
+    told = refused(capsys, tmp_path, diagonal, "--above-table", "--json", tmp_path / "out.json")
+    assert "above_table" in told
+    assert "is a surface of 1152 triangles; only models of ropes keep to a workspace" in told
+
+
 # --- many files ----------------------------------------------------------------------------------
 
 
@@ -179,7 +229,7 @@ def test_files_of_one_body_are_one_batch_with_the_same_results(letters, result, 
         sizes.append(len(batch))
         return simplify_batch(body, batch, **options)
 
-    monkeypatch.setattr(simplify, "simplify_batch", counted)
+    monkeypatch.setattr(jaxsimp, "simplify_batch", counted)
     status, together = result(*letters)
     assert (status, sizes) == (0, [3])
     for one, other in zip(alone, together, strict=True):
@@ -320,6 +370,8 @@ def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys
         (("--tolerance", "0"), "tolerance is 0; give metres, above zero"),
         (("--tolerance", "-1e-3"), "tolerance is -0.001; give metres, above zero"),
         (("--tolerance", "nan"), "tolerance is nan; give metres, above zero"),
+        (("--max-stretch", "-0.1"), "max_stretch is -0.1; give a finite number, zero or more"),
+        (("--lower", "0", "0", "1", "--upper", "1", "1", "0"), "give an upper bound above the"),
         (("--json", "none/out.json"), "none is no folder; make it, or give another --json"),
         (("--figure", "none/out.png"), "none is no folder; make it, or give another --figure"),
         (("--json", "."), ". is a folder; give a file with --json"),
@@ -348,7 +400,7 @@ def test_no_goal_is_refused(tmp_path, capsys):
 def test_the_command_runs_in_a_process_of_its_own(tmp_path):
     done = subprocess.run(
         [
-            *(sys.executable, "-m", "jaxsimp.cli.simplify", "V.npz", "M.npz"),
+            *(sys.executable, "-m", "jaxsimp", "simplify", "V.npz", "M.npz"),
             *("--json", "out.json", "--figure", "out.png"),
         ],
         cwd=tmp_path,
@@ -366,7 +418,7 @@ def test_the_command_runs_in_a_process_of_its_own(tmp_path):
     ]
     assert (tmp_path / "out.png").stat().st_size > 10_000
     done = subprocess.run(
-        [sys.executable, "-m", "jaxsimp.cli.simplify", "missing.npz"],
+        [sys.executable, "-m", "jaxsimp", "simplify", "missing.npz"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,

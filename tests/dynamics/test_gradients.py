@@ -27,7 +27,7 @@ CLOTH = cloth((3, 2), (0.06, 0.03))
 def chain(num_particles: int) -> Body:
     """A rope without bending: one offset, which compiles in half the time."""
     body, links = rope(num_particles, 0.1), num_particles - 1
-    names = ("springs", "rest_length", "stiffness", "damping")
+    names = ("springs", "families", "rest_length", "stiffness", "damping")
     return replace(body, **{name: getattr(body, name)[:links] for name in names})
 
 

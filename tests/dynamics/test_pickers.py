@@ -136,7 +136,7 @@ def test_none_holds_nothing():
     np.testing.assert_allclose(idle.position[:, :2], start[:, :2], atol=1e-12)
 
 
-def idle_fall(steps: int, dt: float = 1e-3, drag: float = BODY.drag) -> float:
+def idle_fall(steps: int, dt: float = 1e-3, drag: float = BODY.material.drag) -> float:
     speed = fallen = 0.0
     for _ in range(steps):
         speed += dt * (9.81 - drag * speed)

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from jaxsimp import goals
-from jaxsimp.bodies import Body, cloth, rope
+from jaxsimp.bodies import MATERIALS, Body, cloth, rope
 from jaxsimp.dynamics import (
     NONE,
     Actions,
@@ -42,13 +42,12 @@ def irregular(seed: int = 0, num_particles: int = 9, num_springs: int = 16) -> B
         rest=rest,
         mass=rng.uniform(0.01, 0.03, num_particles),
         springs=pairs,
+        families=np.zeros(num_springs, dtype=int),
         rest_length=np.linalg.norm(np.diff(rest[pairs], axis=1)[:, 0], axis=1),
         stiffness=rng.uniform(10.0, 50.0, num_springs),
         damping=rng.uniform(0.0, 0.05, num_springs),
         faces=np.zeros((0, 3), dtype=int),
-        radius=0.005,
-        drag=0.7,
-        friction=0.4,
+        material=MATERIALS["rope"].changed(thickness=0.01, drag=0.7, friction=0.4),
         shape=(num_particles,),
     )
 
@@ -60,6 +59,7 @@ def one_particle(friction: float = 0.5, drag: float = 0.0) -> Body:
         rest=np.zeros((1, 3)),
         mass=np.array([0.02]),
         springs=np.zeros((0, 2), dtype=int),
+        families=np.zeros(0, dtype=int),
         rest_length=np.zeros(0),
         stiffness=np.zeros(0),
         damping=np.zeros(0),
@@ -104,7 +104,7 @@ def slow_step(body, x, v, dt, gravity, carried):
         if i in carried:
             new_v[i] = carried[i]
         else:
-            a = force[i] / body.mass[i] - body.drag * v[i] - np.array([0.0, 0.0, gravity])
+            a = force[i] / body.mass[i] - body.material.drag * v[i] - np.array([0.0, 0.0, gravity])
             new_v[i] = slow_contact(body, x[i, 2], v[i] + dt * a, dt)
         new_x[i] = x[i] + dt * new_v[i]
     return new_x, new_v
@@ -117,10 +117,10 @@ def slow_contact(body, z, v, dt):
         return v
     normal_impulse = (body.radius - lands_at) / dt  # per unit of mass
     v_tangent, speed = v[:2], np.hypot(*v[:2])
-    if speed <= body.friction * normal_impulse:
+    if speed <= body.material.friction * normal_impulse:
         v_tangent = np.zeros(2)
     else:
-        v_tangent = v_tangent - body.friction * normal_impulse * v_tangent / speed
+        v_tangent = v_tangent - body.material.friction * normal_impulse * v_tangent / speed
     return np.array([*v_tangent, v[2] + normal_impulse])
 
 
@@ -288,7 +288,7 @@ def test_period_of_a_spring():
 
 @pytest.mark.usefixtures("x64")
 def test_momentum_and_angular_momentum_are_kept():
-    body = replace(irregular(), drag=0.0)
+    body = irregular().scaled(drag=0.0)
     velocity = np.random.default_rng(5).normal(size=body.rest.shape)
     start = state_of(body.rest + np.array([0.0, 0.0, 20.0]), velocity)
     final = jit_settle(in_air(body), start, 2000)
@@ -316,7 +316,7 @@ def energy(body: Body, states: State, gravity: float) -> np.ndarray:
 
 @pytest.mark.usefixtures("x64")
 def test_energy_stays_without_damping():
-    body = replace(irregular(), drag=0.0, damping=np.zeros(16))
+    body = irregular().scaled(drag=0.0, damping=0.0)
     velocity = np.random.default_rng(6).normal(size=body.rest.shape)
     dt = 0.05 * largest_time_step(body)
     start = state_of(body.rest + np.array([0.0, 0.0, 500.0]), velocity)
@@ -374,7 +374,7 @@ def test_first_order_in_the_time_step():
         force = np.zeros_like(x)
         np.add.at(force, first, pull[:, None] * towards)
         np.add.at(force, second, -pull[:, None] * towards)
-        a = force / body.mass[:, None] - body.drag * v - [0.0, 0.0, G]
+        a = force / body.mass[:, None] - body.material.drag * v - [0.0, 0.0, G]
         return np.concatenate([v, a]).ravel()
 
     exact = solve_ivp(

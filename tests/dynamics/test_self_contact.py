@@ -50,7 +50,7 @@ def two_pieces(first: Body, second: Body, **changes) -> Body:
     count = first.num_particles
     joined = {
         name: np.concatenate([getattr(first, name), getattr(second, name)])
-        for name in ("rest", "mass", "rest_length", "stiffness", "damping")
+        for name in ("rest", "mass", "families", "rest_length", "stiffness", "damping")
     }
     for name in ("springs", "faces"):
         joined[name] = np.concatenate([getattr(first, name), getattr(second, name) + count])
@@ -385,8 +385,8 @@ def test_pickers_too_fast_for_the_thickness_are_refused():
     make_simulation(body, 1e-3, self_contact=True, top_speed=4.39)
     with pytest.raises(ValueError, match=r"4\.41 m/s; layers of 4 mm .* up to 4\.39"):
         make_simulation(body, 1e-3, self_contact=True, top_speed=4.41)
-    with pytest.raises(ValueError, match="give a radius"):
-        make_self_contact(replace(body, radius=0.0), 1e-3)
+    with pytest.raises(ValueError, match=r"thickness is 0; .* give one above zero"):
+        make_self_contact(body.scaled(thickness=0.0), 1e-3)
     with pytest.raises(ValueError, match="at least 1 time step"):
         make_self_contact(body, 1e-3, interval=0)
     with pytest.raises(ValueError, match="friction is -1"):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsimp.bodies import Body, cloth, rope
+from jaxsimp.bodies import MATERIALS, Body, cloth, rope
 from jaxsimp.dynamics import State, largest_time_step, make_simulation, settle
 
 jit_settle = jax.jit(settle, static_argnames="num_steps")
@@ -23,7 +23,7 @@ def line_matrices(body: Body) -> tuple[np.ndarray, np.ndarray]:
         for matrix, weight in ((stiffness, k), (damping, c)):
             matrix[[i, j], [i, j]] += weight
             matrix[[i, j], [j, i]] -= weight
-    damping += body.drag * np.diag(body.mass)
+    damping += body.material.drag * np.diag(body.mass)
     return stiffness / body.mass[:, None], damping / body.mass[:, None]
 
 
@@ -47,7 +47,7 @@ def critical(body: Body) -> float:
 
 
 UNDAMPED = rope(9, 0.1, damping=0.0, drag=0.0)
-PROPORTIONAL = replace(UNDAMPED, damping=1e-4 * UNDAMPED.stiffness, drag=3.0)
+PROPORTIONAL = replace(rope(9, 0.1, drag=3.0), damping=1e-4 * UNDAMPED.stiffness)
 DEFAULT = rope(9, 0.1)
 
 
@@ -140,13 +140,12 @@ def test_random_bodies_at_their_largest_step_do_not_blow_up(seed):
             rest=rest,
             mass=mass,
             springs=pairs,
+            families=np.zeros(num_springs, dtype=int),
             rest_length=length,
             stiffness=stiffness,
             damping=2 * ratio * np.sqrt(stiffness * reduced),
             faces=np.zeros((0, 3), dtype=int),
-            radius=0.0,
-            drag=drag,
-            friction=0.5,
+            material=MATERIALS["rope"].changed(thickness=0.0, drag=drag),
             shape=(num_particles,),
         )
         part = 1.0 if ratio > 0.1 else 0.5

@@ -165,6 +165,7 @@ def test_gradients_of_a_body_without_springs():
     body = replace(
         body,
         springs=np.zeros((0, 2), dtype=body.springs.dtype),
+        families=np.zeros(0, dtype=int),
         rest_length=none,
         stiffness=none,
         damping=none,

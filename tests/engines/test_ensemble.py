@@ -18,7 +18,7 @@ from jaxsimp.dynamics import (
     rollout,
 )
 from jaxsimp.engines import Ensemble, MassSprings, Spread, make_ensemble
-from jaxsimp.engines.ensemble import QUANTITIES, draw_factors, scaled_body
+from jaxsimp.engines.ensemble import QUANTITIES, draw_factors
 from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner
 from jaxsimp.tasks import Task, make_task
 
@@ -59,7 +59,7 @@ def costs_alone(task: Task, members: Ensemble, index: int) -> np.ndarray:
     """Costs of `plans()` in one member: by rollouts of a body made from its factors."""
     factors = dict(zip(QUANTITIES, members.factors[index].tolist(), strict=True))
     time_step = float(members.simulations.time_step[0]) * factors.pop("time_step")
-    simulation = make_simulation(scaled_body(task.body, **factors), time_step)
+    simulation = make_simulation(task.body.scaled(**factors), time_step)
     pickers, episode = make_pickers(task.limits, steps=members.action_steps), task.episode_fn(0)
     found = []
     for pick, displacement in zip(plans().pick, plans().displacement, strict=True):
@@ -68,7 +68,7 @@ def costs_alone(task: Task, members: Ensemble, index: int) -> np.ndarray:
             jnp.concatenate([displacement, jnp.zeros((1, 2, 3))]),
         )
         _, frames = jit_rollout(simulation, pickers, at_rest(episode.start), actions)
-        found.append(sum(float(task.cost_fn(episode, frame)) for frame in frames))
+        found.append(sum(float(task.terminal_cost(episode, at_rest(frame))) for frame in frames))
     return np.array(found)
 
 
@@ -222,7 +222,7 @@ def test_every_member_is_stable():
     task, made = small_task(), make_ensemble(small_task(), 7, 4, Spread(stiffness=2.5))
     for row, time_step in zip(made.factors, made.simulations.time_step, strict=True):
         factors = dict(zip(QUANTITIES[:-1], row[:-1].tolist(), strict=True))
-        largest = largest_time_step(scaled_body(task.body, **factors))
+        largest = largest_time_step(task.body.scaled(**factors))
         assert float(time_step) <= 0.9 * largest * (1 + 1e-6)  # rounded to float32
 
 

@@ -94,7 +94,7 @@ def test_the_model_is_the_body():
     np.testing.assert_array_equal(model.tendon_damping, body.damping)
     np.testing.assert_array_equal(model.tendon_lengthspring[:, 0], body.rest_length)
     np.testing.assert_array_equal(model.tendon_lengthspring[:, 1], body.rest_length)
-    np.testing.assert_array_equal(model.dof_damping, np.repeat(body.drag * body.mass, 3))
+    np.testing.assert_array_equal(model.dof_damping, np.repeat(body.material.drag * body.mass, 3))
     np.testing.assert_array_equal(model.opt.gravity, [0.0, 0.0, -5.0])
     assert model.opt.timestep == 1e-3
     assert model.ngeom == 0

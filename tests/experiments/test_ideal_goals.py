@@ -15,8 +15,7 @@ from experiments.ideal_goals import (
     rounded_fold,
 )
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
-from jaxsimp import goals
-from jaxsimp.bodies import body
+from jaxsimp import bodies, goals
 from jaxsimp.simplification import KeyPoints
 
 ROUNDING = 1e-12  # metres
@@ -24,7 +23,7 @@ ROUNDING = 1e-12  # metres
 
 @cache
 def cloth(rows=16, columns=16):
-    return body.cloth((rows, columns), (0.3, 0.3 * columns / rows), radius=0.002)
+    return bodies.cloth((rows, columns), (0.3, 0.3 * columns / rows))
 
 
 def key_points(particles, count):
@@ -189,7 +188,7 @@ def test_two_true_points_cannot_share_a_key_point():
 @pytest.mark.parametrize("name", LINES)
 @pytest.mark.parametrize("rounding", [0.0, 0.01])
 def test_a_rope_lies_along_its_line_with_corners_at_the_true_points(name, rounding):
-    rope = body.rope(201, 1.0)
+    rope = bodies.rope(201, 1.0)
     ideal = ideal_line(rope, name, rounding=rounding)
     assert len(ideal.true_points) == len(LINES[name])
     steps = np.linalg.norm(np.diff(ideal.goal, axis=0), axis=1)
@@ -210,7 +209,7 @@ def test_a_rope_lies_along_its_line_with_corners_at_the_true_points(name, roundi
 
 @pytest.mark.parametrize("name", SETTLED_FOLDS)
 def test_a_settled_fold_is_near_the_ideal_one_and_at_rest_on_the_table(name):
-    sheet = body.cloth((13, 13))
+    sheet = bodies.cloth((13, 13))
     found, again = settled_goal(sheet, name, 1), settled_goal(sheet, name, 1)
     assert np.array_equal(found.goal, again.goal)
     assert not np.array_equal(found.goal, settled_goal(sheet, name, 2).goal)

@@ -367,7 +367,7 @@ def test_the_paper_budget_is_the_authors():
 def test_studies_that_plan_otherwise_have_another_folder():
     for planning, name in (("nominal", "goals"), ("mixed", "goals-mixed")):
         options = run.GoalsOptions(planning=planning)
-        assert run.results_folder(options).name == name
+        assert options.folder().name == name
         assert options.configuration().planning == planning
 
 
@@ -375,6 +375,4 @@ def test_a_smoke_run_is_small():
     study = run.PaperOptions(smoke=True).configuration()
     assert study.seeds == 2
     assert study.task("cloth_side_folding").body.num_particles == 81
-    assert run.results_folder(run.PaperOptions(smoke=True)) != run.results_folder(
-        run.PaperOptions()
-    )
+    assert run.PaperOptions(smoke=True).folder() != run.PaperOptions().folder()

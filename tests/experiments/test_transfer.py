@@ -182,7 +182,7 @@ def test_what_judges_plans_is_part_of_what_a_study_is():
     rounds = [each["search"]["rope_folding"]["num_iterations"] for each in (nominal, touching)]
     assert rounds == [3, 2]  # half of them, for each takes longer
     assert robust["ensemble"]["size"] == 4
-    assert [run.results_folder(each).name for each in options] == [
+    assert [each.folder().name for each in options] == [
         "transfer-nominal-smoke",
         "transfer-robust-smoke",
         "transfer-self_contact-smoke",

@@ -143,13 +143,12 @@ def test_pieces_that_no_spring_joins_may_be_anywhere():
         rest=np.concatenate([one.rest, one.rest + np.array([0, 0.1, 0])]),
         mass=np.ones(6),
         springs=np.concatenate([one.springs, one.springs + 3]),
+        families=np.tile(one.families, 2),
         rest_length=np.tile(one.rest_length, 2),
         stiffness=np.ones(6),
         damping=np.zeros(6),
         faces=np.zeros((0, 3), dtype=int),
-        radius=0.001,
-        drag=0.0,
-        friction=0.0,
+        material=one.material,
         shape=(6,),
     )
     goals.check_goal(pair, pair.rest + np.repeat([0.0, 3.0], 3)[:, None])

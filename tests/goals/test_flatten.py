@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jaxsimp import goals
 from jaxsimp.bodies import cloth
 from jaxsimp.bodies.garments import t_shirt, trousers
-from jaxsimp.bodies.meshes import half_edges
+from jaxsimp.bodies.topology import half_edges
 from jaxsimp.goals.flatten import flatten
 from jaxsimp.simplification import simplify
 
@@ -41,7 +41,7 @@ def longest_excess(body, goal):
 @pytest.mark.parametrize("name", FOLDS)
 def test_folds_of_no_thickness_are_undone(name):
     # Layers coincide in space, and every edge has its length: the rest coordinates are exact.
-    thin = cloth(radius=0.0)
+    thin = cloth(thickness=0.0)
     found = flatten(folded(thin, name), thin.faces)
     assert distance(found, thin.rest[:, :2]) < 1e-8  # Gauss-Newton has settled long before
 
@@ -78,7 +78,7 @@ def test_key_points_are_those_of_the_goal_with_rest(name, tmp_path):
 @pytest.mark.parametrize("radius", [0.0, 0.002])
 def test_a_crease_across_edges_costs_a_triangle_at_most(radius):
     # The crease runs across the diagonals of the cells: their ends coincide, but for thickness.
-    body = cloth(radius=radius)
+    body = cloth(thickness=2 * radius)
     goal = goals.fold(body, goals.flat(body), np.zeros(2), np.array([1.0, 1.0]))
     found = flatten(goal, CLOTH.faces)
     assert distance(found, CLOTH.rest[:, :2]) < np.sqrt(2) * CLOTH.spacing

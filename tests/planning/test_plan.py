@@ -165,7 +165,7 @@ def test_the_cost_of_a_plan_is_that_of_an_independent_rollout(returns):
     plan = planned(3, "categorical", LAYOUT, returns)
     task, episode = small_task(), small_task().episode_fn(3)
     frames = independent_frames(plan.actions)
-    steps = [float(task.cost_fn(episode, frame)) for frame in frames[1:-1]]
+    steps = [float(task.terminal_cost(episode, at_rest(frame))) for frame in frames[1:-1]]
     assert len(steps) == 3  # two actions, and the state that is left
     # rounding of other machine code, see test_layouts_agree_on_the_costs
     assert plan.search.cost == pytest.approx(sum(steps), rel=1e-4)

@@ -1,16 +1,12 @@
-"""Results folders: one configuration each, rows that survive a kill, provenance."""
+"""Results folders: one configuration each, and JSON files that are whole."""
 
-import importlib.metadata
 import json
-import os
-import platform
-import subprocess
 from pathlib import Path
 
 import pytest
 
-from jaxsimp.records import folder as records
-from jaxsimp.records.folder import ResultsError, append_row, open_folder, read_rows, write_json
+from jaxsimp.records import folder as module
+from jaxsimp.records.folder import ResultsError, open_folder, write_json
 
 CONFIG = {"tasks": ("a", "b"), "seeds": 3, "quick": True, "settings": {"population": 8}}
 
@@ -71,7 +67,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path, monkeypatch):
     def read_only(path, value):
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(records, "write_json", read_only)
+    monkeypatch.setattr(module, "write_json", read_only)
     with pytest.raises(ResultsError, match=r"cannot be written to \(Permission denied\).* --out"):
         open_folder(tmp_path, CONFIG)
     assert names(tmp_path) == []
@@ -128,84 +124,3 @@ def test_json_that_cannot_be_written_leaves_the_old(tmp_path):
     with pytest.raises(TypeError):
         write_json(path, {"new": object()})
     assert json.loads(path.read_text()) == {"old": 1}
-
-
-ROWS = [{"seed": 0, "name": "ü\u2028 \n"}, {"seed": 1, "cost": None}, {"seed": 2}]
-
-
-def test_rows_come_back_in_order(tmp_path):
-    path = tmp_path / "runs.jsonl"
-    assert read_rows(path) == []
-    for row in ROWS:
-        append_row(path, row)
-    assert read_rows(path) == ROWS
-    assert len(path.read_text().split("\n")) == len(ROWS) + 1
-
-
-def test_a_row_cut_short_at_any_byte_is_dropped_and_the_file_can_be_continued(tmp_path):
-    path = tmp_path / "runs.jsonl"
-    for row in ROWS:
-        append_row(path, row)
-    whole = path.read_bytes()
-    ends = [0, *(i + 1 for i, byte in enumerate(whole) if byte == ord("\n"))]
-    for size in range(len(whole) + 1):
-        path.write_bytes(whole[:size])
-        complete = sum(end <= size for end in ends) - 1
-        assert read_rows(path) == ROWS[:complete]
-        assert path.stat().st_size == ends[complete]
-        append_row(path, {"more": 1})
-        assert read_rows(path) == [*ROWS[:complete], {"more": 1}]
-
-
-# --- provenance ----------------------------------------------------------------------------------
-
-
-def test_environment_says_what_results_depend_on():
-    found = records.environment()
-    assert json.loads(json.dumps(found)) == found
-    assert found["python"] == platform.python_version()
-    for name in ("jax", "numpy", "scipy", "proxsuite"):
-        assert found["versions"][name] == importlib.metadata.version(name)
-    assert found["cores"] == len(os.sched_getaffinity(0))
-    assert found["device"] == "cpu"
-    assert found["num_devices"] == 1
-    assert found["x64"] is False
-    assert found["processor"]
-    assert found["platform"] == platform.platform()
-
-
-def test_environment_says_when_results_are_in_float64(x64):
-    assert records.environment()["x64"] is True
-
-
-def repository(folder: Path) -> Path:
-    """A package of one module in a git repository with one commit."""
-    module = folder / "experiments" / "records.py"
-    module.parent.mkdir()
-    module.write_text("")
-    git = ["git", "-C", str(folder), "-c", "user.name=n", "-c", "user.email=e@x"]
-    subprocess.run([*git, "init", "-q"], check=True)
-    subprocess.run([*git, "add", "."], check=True)
-    subprocess.run([*git, "commit", "-q", "--no-verify", "-m", "first"], check=True)
-    return module
-
-
-def test_the_commit_is_named_and_changes_are_marked(tmp_path, monkeypatch):
-    module = repository(tmp_path)
-    monkeypatch.setattr(records, "__file__", str(module))
-    commit = records.environment()["commit"]
-    assert len(commit) == 40
-    assert set(commit) <= set("0123456789abcdef")
-    module.write_text("changed = True")
-    assert records.environment()["commit"] == commit + "+changes"
-
-
-def test_code_outside_a_repository_has_no_commit(tmp_path, monkeypatch):
-    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    monkeypatch.setattr(records, "__file__", str(tmp_path / "records.py"))
-    assert records.environment()["commit"] == "unknown"
-
-
-def test_git_that_is_missing_is_no_error(monkeypatch):
-    monkeypatch.setenv("PATH", "")
-    assert records.environment()["commit"] == "unknown"

@@ -4,7 +4,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsimp.bodies import body
+from jaxsimp import bodies
 from jaxsimp.simplification.interpolation import (
     interpolation_weights,
     model_errors,
@@ -67,7 +67,7 @@ def test_a_simplex_in_one_point_is_that_point(corners):
 @given(seeds)
 def test_affine_goals_are_exact_inside_of_the_model(seed):
     rng = np.random.default_rng(seed)
-    sheet = body.cloth((6, 8), (0.3, 0.4))
+    sheet = bodies.cloth((6, 8), (0.3, 0.4))
     corners = np.array([0, 7, 40, 47])
     goal = sheet.rest @ rng.normal(size=(3, 3)) + rng.normal(size=3)
     weights = interpolation_weights(sheet.rest, corners, np.array([[0, 2, 1], [2, 3, 1]]))
@@ -79,7 +79,7 @@ def test_affine_goals_are_exact_inside_of_the_model(seed):
 
 
 def test_a_rope_is_interpolated_between_its_neighbouring_key_points():
-    rope = body.rope(11)
+    rope = bodies.rope(11)
     weights = interpolation_weights(rope.rest, np.array([0, 4, 10]), np.array([[0, 1], [1, 2]]))
     expected = [np.interp(range(11), [0, 4, 10], row) for row in np.eye(3)]
     assert np.allclose(weights, np.transpose(expected), rtol=0, atol=ROUNDING)

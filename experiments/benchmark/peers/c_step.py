@@ -54,7 +54,8 @@ def prepare(workload: Workload, num_threads: int) -> Callable[[], np.ndarray]:
     tables = (springs.stiffness, springs.stiffness * springs.rest_length, springs.damping)
     arrays = [np.pad(table, halo).astype(np.float32) for table in tables]
     arrays.append((dt / body.mass).astype(np.float32))
-    physics = _Physics(body.radius, body.friction, body.drag, GRAVITY, dt, workload.shortest)
+    friction, drag = body.material.friction, body.material.drag
+    physics = _Physics(body.radius, friction, drag, GRAVITY, dt, workload.shortest)
     start, shares = (np.ascontiguousarray(a, np.float32) for a in (workload.start, workload.shares))
     pick, move = workload.pick, workload.displacement
     sizes = pick.shape[1], workload.action_steps, pick.shape[2]

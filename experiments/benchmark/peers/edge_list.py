@@ -33,11 +33,11 @@ def prepare(workload: Workload) -> Callable[[], np.ndarray]:
         tension = stiffness * (1 - rest_length / length) + damping * rate / length**2
         pull = tension[:, None] * along
         force = jnp.zeros_like(x).at[first].add(pull).at[second].add(-pull)
-        v = v * (1 - dt * body.drag) + dt * force / mass[:, None]
+        v = v * (1 - dt * body.material.drag) + dt * force / mass[:, None]
         v = v.at[:, 2].add(-dt * GRAVITY)
         normal = jnp.maximum(v[:, 2], (body.radius - x[:, 2]) / dt)
         sliding = jnp.sqrt(jnp.maximum(v[:, 0] ** 2 + v[:, 1] ** 2, 1e-12))
-        kept = jnp.maximum(0.0, 1 - body.friction * (normal - v[:, 2]) / sliding)
+        kept = jnp.maximum(0.0, 1 - body.material.friction * (normal - v[:, 2]) / sliding)
         v = jnp.stack([v[:, 0] * kept, v[:, 1] * kept, normal], axis=1)
         v = v.at[pick].set(carried)
         return x + dt * v, v

@@ -76,8 +76,8 @@ def _contact_fn(workload: Workload) -> Callable[[Array, Array, Array], Array]:
     """Velocities after forces, drag, gravity and contact, all of shape (3, N, b)."""
     body, dt = workload.body, np.float32(workload.time_step)
     dt_over_mass = (workload.time_step / body.mass).astype(np.float32)[:, None]
-    keep, fall = np.float32(1 - workload.time_step * body.drag), dt * np.float32(GRAVITY)
-    radius, friction = np.float32(body.radius), np.float32(body.friction)
+    keep, fall = np.float32(1 - workload.time_step * body.material.drag), dt * np.float32(GRAVITY)
+    radius, friction = np.float32(body.radius), np.float32(body.material.friction)
 
     def contact(x: Array, v: Array, force: Array) -> Array:
         force *= dt_over_mass

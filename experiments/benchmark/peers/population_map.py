@@ -16,7 +16,7 @@ from jaxsimp.dynamics import (
     make_simulation,
     rollout,
 )
-from jaxsimp.planning import Layout, PopulationMap, default_layout
+from jaxsimp.engines import Layout, PopulationMap, default_layout, spring_chunk_size
 
 Physics = tuple[Simulation, Pickers, Array]
 """A simulation, its pickers, and the positions at first."""
@@ -30,7 +30,7 @@ def prepare(workload: Workload, layout: Layout | None = None) -> Callable[[], np
         layout: of the population; jaxsimp's own choice by default.
     """
     shared, actions = physics(workload), plans(workload)
-    layout = layout or default_layout(workload.population, shared[0])
+    layout = layout or default_layout(workload.population, spring_chunk_size(shared[0]))
     mapped = PopulationMap(final_position, shared, actions, layout)
     return lambda: mapped(shared, actions)
 

@@ -45,8 +45,8 @@ def prepare(workload: Workload) -> Callable[[], np.ndarray]:
     move = _scalars(in_lanes(workload.displacement, LANES), ti.f32)
     blocks, num_actions, _, num_pickers = pick.shape
     scale, share = _scalars(dt / body.mass, ti.f32), _scalars(workload.shares / dt, ti.f32)
-    floor, keep, fall = workload.shortest**2, 1 - dt * body.drag, dt * GRAVITY
-    radius, friction = body.radius, body.friction
+    floor, keep, fall = workload.shortest**2, 1 - dt * body.material.drag, dt * GRAVITY
+    radius, friction = body.radius, body.material.friction
     start = _scalars(workload.start, ti.f32)
     # Position, velocity and force of a particle lie side by side.
     x, y, z, u, v, w, fx, fy, fz = state = [ti.Vector.field(LANES, ti.f32) for _ in range(9)]

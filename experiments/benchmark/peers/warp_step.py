@@ -175,8 +175,8 @@ def _physics(workload: Workload) -> Any:
     ends, numbers = sorted_springs(body)
     physics = Physics()
     physics.time_step, physics.floor = dt, workload.shortest**2
-    physics.keep, physics.fall = 1 - dt * body.drag, dt * GRAVITY
-    physics.radius, physics.friction = body.radius, body.friction
+    physics.keep, physics.fall = 1 - dt * body.material.drag, dt * GRAVITY
+    physics.radius, physics.friction = body.radius, body.material.friction
     physics.steps = workload.action_steps
     physics.ends, physics.spring = _array(ends, wp.int32), _array(numbers, wp.vec3)
     physics.scale = _array(dt / body.mass, wp.float32)

@@ -121,13 +121,12 @@ def shuffled(body: Body, seed: int = 0) -> Body:
         rest=body.rest[order],
         mass=body.mass[order],
         springs=rank[body.springs],
-        rest_length=body.rest_length.copy(),
-        stiffness=body.stiffness.copy(),
-        damping=body.damping.copy(),
+        families=body.families,
+        rest_length=body.rest_length,
+        stiffness=body.stiffness,
+        damping=body.damping,
         faces=rank[body.faces],
-        radius=body.radius,
-        drag=body.drag,
-        friction=body.friction,
+        material=body.material,
         shape=(body.num_particles,),
     )
 

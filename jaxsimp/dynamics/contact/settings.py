@@ -1,5 +1,6 @@
 """How a body touches itself: what self-contact has to know of it, and the speeds it bears."""
 
+import itertools
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import face_areas
+from jaxsimp.bodies.topology import connected_pieces, half_edges, neighbours
 
 TOP_SPEED = 2.1
 """Default of the fastest that pickers may move, metres per second."""
@@ -94,12 +96,12 @@ def make_self_contact(
         ValueError: if the body has no thickness, pickers are too fast for it, or a number is out
             of its range.
     """
-    thickness = 2 * body.radius
+    thickness = body.material.thickness
     if not thickness > 0:
-        raise ValueError("radius is 0; self-contact needs a body of some thickness: give a radius")
+        raise ValueError("thickness is 0; self-contact needs layers of some: give one above zero")
     if interval < 1:
         raise ValueError(f"interval is {interval}; contact acts after at least 1 time step")
-    friction = body.friction if friction is None else friction
+    friction = body.material.friction if friction is None else friction
     if not 0 <= friction < np.inf:
         raise ValueError(f"friction is {friction}; give a finite number, zero or more")
     seconds = interval * time_step
@@ -111,7 +113,7 @@ def make_self_contact(
             f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "
             f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s when contact "
             f"acts every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a "
-            f"smaller time step or interval, or a larger radius; or leave self-contact out"
+            f"smaller time step or interval, or a larger thickness; or leave self-contact out"
         )
     covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.
@@ -155,21 +157,16 @@ def _covering_radius(body: Body) -> float:
 
 def _apart(body: Body) -> np.ndarray:
     """Rest coordinates, each part that no spring joins to the others far from them."""
-    from scipy import sparse
-
-    first, second = body.springs.T
-    shape = (body.num_particles, body.num_particles)
-    graph = sparse.csr_array((np.ones(len(first)), (first, second)), shape=shape)
-    _, part = sparse.csgraph.connected_components(graph, directed=False)
+    _, part = connected_pieces(body.springs, body.num_particles)
     return body.rest + 10 * body.size * part[:, None] * np.array([1.0, 0.0, 0.0])
 
 
 def _frames(body: Body) -> np.ndarray:
     """Ids for `SelfContact.frame`: the farthest apart, and the most square to them, around each."""
-    neighbours = _neighbours(body)
+    starts, others = neighbours(_next(body), body.num_particles)
     frames = np.zeros((4, body.num_particles), dtype=int)
-    for particle, others in enumerate(neighbours):
-        ids = np.append(others, particle)
+    for particle, (start, end) in enumerate(itertools.pairwise(starts)):
+        ids = np.append(others[start:end], particle)
         first, second = np.triu_indices(len(ids), k=1)
         along = body.rest[ids[first]] - body.rest[ids[second]]
         best = np.argmax(np.linalg.norm(along, axis=1))
@@ -178,14 +175,8 @@ def _frames(body: Body) -> np.ndarray:
     return frames
 
 
-def _neighbours(body: Body) -> list[np.ndarray]:
-    """Next neighbours of each particle: along edges of triangles, or the shorter springs."""
+def _next(body: Body) -> Int[np.ndarray, "_ 2"]:
+    """Pairs of next neighbours: along edges of triangles, or the shorter springs."""
     if len(body.faces):
-        pairs = np.concatenate(
-            [body.faces[:, [0, 1]], body.faces[:, [1, 2]], body.faces[:, [2, 0]]]
-        )
-    else:
-        pairs = body.springs[body.rest_length < 1.5 * _spacing(body)]
-    pairs = np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0)
-    counts = np.bincount(pairs[:, 0], minlength=body.num_particles)
-    return np.split(pairs[:, 1], np.cumsum(counts)[:-1])
+        return half_edges(body.faces)[0]
+    return body.springs[body.rest_length < 1.5 * _spacing(body)]

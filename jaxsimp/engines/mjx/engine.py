@@ -9,7 +9,6 @@ second opinion on contact. Gradients are not promised.
 
 import contextlib
 import io
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -19,10 +18,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxsimp.bodies import Body
-from jaxsimp.dynamics import Actions, Pickers, State, make_simulation
+from jaxsimp.dynamics import Actions, Pickers, Simulation, State, make_simulation
 from jaxsimp.dynamics.contact.table import table_contact
 from jaxsimp.dynamics.pickers import grasp, speed_profile
+from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.mjx.tendons import tendon_spec
+from jaxsimp.engines.rollouts import RolloutExecutor
+from jaxsimp.engines.springs import CHUNK_SIZE
 from jaxsimp.tasks import Task
 
 MOST_PARTICLES = 100
@@ -32,7 +34,7 @@ takes about fifty times as long as our own for a rope of 11, a thousand times fo
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["model", "data", "rest", "radius", "friction"],
+    data_fields=["model", "data", "ours"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
@@ -42,16 +44,12 @@ class MJXSimulation:
     Attributes:
         model: a `mujoco.mjx.Model`.
         data: a `mujoco.mjx.Data` to put states into.
-        rest: rest coordinates, shape (N, 3), metres.
-        radius: height of a particle that lies on the table, metres.
-        friction: Coulomb coefficient with the table.
+        ours: the body's simulation in our dynamics, for our table and pickers.
     """
 
     model: Any
     data: Any
-    rest: Float[Array, "... N 3"]
-    radius: Float[Array, "..."]
-    friction: Float[Array, "..."]
+    ours: Simulation
 
     @property
     def time_step(self) -> Float[Array, "..."]:
@@ -81,9 +79,7 @@ def make_mjx_simulation(
         )
     ours = make_simulation(body, time_step, gravity)
     model = to_mjx(tendon_spec(body, time_step, gravity).compile())
-    return MJXSimulation(
-        model, _mjx().make_data(model, impl="jax"), ours.rest, ours.radius, ours.friction
-    )
+    return MJXSimulation(model, _mjx().make_data(model, impl="jax"), ours)
 
 
 def to_mjx(model: Any) -> Any:
@@ -128,21 +124,20 @@ def mjx_rollout(
     pickers: Pickers,
     state: State,
     actions: Actions,
-    observe: Callable[[State], PyTree[Any]] = lambda state: state.position,
+    observe: Observe = lambda state, action: state.position,
 ) -> tuple[State, PyTree[Any]]:
-    """Carry out a plan in MJX: arguments and result as of `jaxsimp.dynamics.rollout`."""
+    """Carry out a plan in MJX: arguments and result as of `SearchEngine.rollout`."""
 
     def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:
-        held, displacement = grasp(
-            pickers, simulation.rest, simulation.radius, state.position, action
-        )
+        ours = simulation.ours
+        held, displacement = grasp(pickers, ours.rest, ours.radius, state.position, action)
         drive = displacement / simulation.time_step
 
         def one(state: State, share: Float[Array, ""]) -> tuple[State, None]:
             return _step(simulation, state, held, drive * share), None
 
         state, _ = jax.lax.scan(one, state, speed_profile(pickers.steps))
-        return state, observe(state)
+        return state, observe(state, action)
 
     return jax.lax.scan(act, state, actions)
 
@@ -155,8 +150,7 @@ def _step(
 ) -> State:
     """A step of MJX with velocities after contact; held particles have those of `carried`."""
     free = _free_step(simulation, state)[0].velocity
-    above = state.position[:, 2] - simulation.radius
-    touched = table_contact(above, list(free.T), simulation.friction, simulation.time_step)
+    touched = table_contact(simulation.ours, state.position[:, 2], list(free.T))
     velocity = jnp.where(held[:, None], carried, jnp.stack(touched, axis=1))
     return State(state.position + simulation.time_step * velocity, velocity)
 
@@ -205,7 +199,19 @@ class MJX:
         physics: tuple[MJXSimulation, Pickers],
         state: State,
         actions: Actions,
-        observe: Callable[[State], PyTree[Any]],
+        observe: Observe,
     ) -> tuple[State, PyTree[Any]]:
         """See `mjx_rollout`."""
         return mjx_rollout(*physics, state, actions, observe)
+
+    def risk(self, costs: Float[Array, ""]) -> Float[Array, ""]:
+        """The cost itself."""
+        return costs
+
+    def chunk_size(self, physics: tuple[MJXSimulation, Pickers]) -> int:
+        """As of mass-springs: not measured."""
+        return CHUNK_SIZE
+
+    def executor(self, task: Task) -> Executor:
+        """See `Engine.executor`."""
+        return RolloutExecutor(task, self, self.physics(task))

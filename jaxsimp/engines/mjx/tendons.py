@@ -63,7 +63,7 @@ def _add_particle(spec: Any, body: Body, particle: int) -> None:
             type=mujoco.mjtJoint.mjJNT_SLIDE,
             axis=axis,
             ref=coordinate,
-            damping=body.drag * mass,
+            damping=body.material.drag * mass,
         )
     added.add_site(name=_particle(particle), size=[size] * 3)
 

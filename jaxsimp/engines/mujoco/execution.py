@@ -9,7 +9,6 @@ plan's result does not depend on the others.
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import partial
 from typing import Any
 
@@ -20,7 +19,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsimp.dynamics import NONE, Actions, Pickers, make_pickers
 from jaxsimp.dynamics.pickers import grasp, speed_profile
-from jaxsimp.engines.mujoco.model import Variant, make_model
+from jaxsimp.engines.engine import Execution, ExecutionStatus, Executor
+from jaxsimp.engines.mujoco.model import Variant, as_variant, make_model
 from jaxsimp.machine import num_cores
 from jaxsimp.tasks import Episode, Task, score
 
@@ -35,35 +35,29 @@ STILL, STILL_SECONDS = 5e-3, 0.1
 so long. A folded cloth then creeps on, by some 0.4 mm in the rest of the task's time."""
 
 
-class ReplayStatus(IntEnum):
-    """What became of a plan in MuJoCo.
-
-    `WARNED`: it was carried out, and MuJoCo warned of something, as contacts left out.
-    `UNSTABLE`: a position, velocity or acceleration was not finite or too large (see `FASTEST`);
-    the plan ends there.
-    """
-
-    FINE = 0
-    WARNED = 1
-    UNSTABLE = 2
-
-
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """What a plan does in MuJoCo.
+@dataclass(frozen=True)
+class MuJoCo:
+    """MuJoCo as an engine: it evaluates plans, and cannot search.
 
     Attributes:
-        positions: at the start, after each action, and settled, shape (T + 2, N, 3), metres; not
-            a number after the simulation became unstable.
-        score: normalised score of the settled state, not a number where it is unstable.
-        status: what became of the plan.
-        warnings: names of MuJoCo's warnings.
+        variant: of the model, see `jaxsimp.engines.mujoco.model`.
     """
 
-    positions: Float[np.ndarray, "T2 N 3"]
-    score: float
-    status: ReplayStatus
-    warnings: tuple[str, ...]
+    variant: str | Variant = "full"
+
+    def executor(self, task: Task) -> Executor:
+        """See `Engine.executor`; a model is compiled for each plan, with the particles it grasps.
+
+        Raises:
+            ValueError: if there is no such variant.
+        """
+        variant = as_variant(self.variant)
+
+        def execute(episode: Episode, actions: Actions) -> Execution:
+            (found,) = replay(task, [episode], [actions], variant)
+            return found
+
+        return execute
 
 
 def replay(
@@ -73,7 +67,7 @@ def replay(
     variant: str | Variant = "full",
     *,
     num_workers: int | None = None,
-) -> Iterator[Replay]:
+) -> Iterator[Execution]:
     """Carry out plans in MuJoCo, let the body settle, and score them.
 
     Results come one by one, in the order of the plans; the first is begun when it is asked for,
@@ -101,11 +95,11 @@ def replay(
 
 
 def _side_by_side(
-    one: Callable[[Episode, Actions], Replay],
+    one: Executor,
     episodes: Sequence[Episode],
     plans: Sequence[Actions],
     num_workers: int,
-) -> Iterator[Replay]:
+) -> Iterator[Execution]:
     with ThreadPoolExecutor(num_workers) as pool:
         yield from pool.map(one, episodes, plans)
 
@@ -116,7 +110,7 @@ def _replay_one(
     score_fn: Callable[[Episode, Float[Array, "N 3"]], Float[Array, ""]],
     episode: Episode,
     plan: Actions,
-) -> Replay:
+) -> Execution:
     """Carry out one plan."""
     scene = _Scene(task, model, np.asarray(episode.start, dtype=float))
     frames = [scene.positions()]
@@ -128,9 +122,9 @@ def _replay_one(
     scene.settle(task.settle_actions)
     frames.append(scene.positions())
     warnings, unstable = scene.warnings(), scene.unstable
-    status = ReplayStatus.UNSTABLE if unstable else ReplayStatus(bool(warnings))
+    status = ExecutionStatus.UNSTABLE if unstable else ExecutionStatus(bool(warnings))
     value = float("nan") if unstable else float(score_fn(episode, jnp.asarray(frames[-1])))
-    return Replay(np.stack(frames), value, status, warnings)
+    return Execution(np.stack(frames), value, status, warnings)
 
 
 class _Scene:

@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxsimp.bodies import Body
-from jaxsimp.bodies.meshes import face_areas, half_edges
+from jaxsimp.bodies.meshes import face_areas
+from jaxsimp.bodies.topology import are_among, chain, half_edges
 from jaxsimp.dynamics import largest_time_step
 
 POISSON = 1 / 3
@@ -96,7 +97,9 @@ def bending_rigidity(body: Body) -> float:
     `2 D a^2 / L^2` a length. Equal at `a = 1` for `D = sum k L^4 / (256 length)`. Over a sheet,
     a spring at an angle to the curvature feels `cos^8` of it, 35/128 in the mean.
     """
-    across = ~_is_edge(body)
+    # Springs that are edges of the flex do not resist bending.
+    edges = half_edges(body.faces)[0] if len(body.faces) else chain(body.num_particles)
+    across = ~are_among(body.springs, edges)
     total = float(np.sum((body.stiffness * body.rest_length**4)[across])) / 256
     return 35 / 128 * total / _area(body) if len(body.faces) else total / _length(body)
 
@@ -161,7 +164,7 @@ def _spec(body: Body, variant: Variant, graspable: Iterable[int], table: bool) -
         _add_particle(spec, name, place, float(mass), SIDE * float(mass / body.mass.mean()))
     radius = _contact_radius(body, variant)
     contact = {
-        "friction": [body.friction, 0.0, 0.0],
+        "friction": [body.material.friction, 0.0, 0.0],
         "condim": 3,
         "solref": _stiffest(spec.option.timestep),
     }
@@ -196,7 +199,7 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
 
     option = spec.option
     # A cube of side s in air of this viscosity feels the force 3 pi s viscosity v.
-    option.viscosity = body.drag * float(body.mass.mean()) / (3 * np.pi * SIDE)
+    option.viscosity = body.material.drag * float(body.mass.mean()) / (3 * np.pi * SIDE)
     option.gravity = [0.0, 0.0, -GRAVITY]
     option.timestep = variant.time_step
     # Friction is the same in all directions, as ours is.
@@ -236,7 +239,7 @@ def _set_elements(flex: Any, body: Body, variant: Variant) -> None:
 
     kind = mujoco.mjtFlexSelf
     flex.dim = 2 if len(body.faces) else 1
-    flex.elem = (body.faces if len(body.faces) else _segments(body)).ravel().tolist()
+    flex.elem = (body.faces if len(body.faces) else chain(body.num_particles)).ravel().tolist()
     flex.selfcollide = kind.mjFLEXSELF_AUTO if variant.self_collision else kind.mjFLEXSELF_NONE
 
 
@@ -305,17 +308,3 @@ def _area(body: Body) -> float:
 def _length(body: Body) -> float:
     """Of a rope along its segments, metres."""
     return float(np.linalg.norm(np.diff(body.rest, axis=0), axis=1).sum())
-
-
-def _segments(body: Body) -> Int[np.ndarray, "M 2"]:
-    """Neighbours along a rope."""
-    ids = np.arange(body.num_particles)
-    return np.stack([ids[:-1], ids[1:]], axis=1)
-
-
-def _is_edge(body: Body) -> np.ndarray:
-    """Whether each spring is an edge of the flex, shape (S,); the others resist bending."""
-    edges = half_edges(body.faces)[0] if len(body.faces) else _segments(body)
-    count = body.num_particles
-    codes = np.sort(edges, axis=1) @ [count, 1]
-    return np.isin(np.sort(body.springs, axis=1) @ [count, 1], codes)

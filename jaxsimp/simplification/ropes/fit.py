@@ -107,6 +107,42 @@ def feasible(goals: Float[np.ndarray, "B N 3"], limits: Limits) -> Bool[np.ndarr
     return possible
 
 
+def why_infeasible(body: Body, goal: Float[np.ndarray, "N 3"], workspace: Workspace) -> str:
+    """Which limit leaves a goal that is not `feasible` without a model, and what to do.
+
+    Args:
+        body: a rope.
+        goal: shape (N, 3), metres.
+        workspace: what the model must keep to.
+    """
+    limits = limits_of(body, workspace)
+    if (limits.lower > limits.upper).any():
+        return (
+            f"no model is within the workspace: it ends at z = {limits.upper[2]:.3g} m, and the "
+            f"model keeps {limits.lower[2]:.3g} m above the table; raise upper, or leave "
+            f"above_table out"
+        )
+    ends = goal[[0, -1]]
+    outside = ((ends < limits.lower) | (ends > limits.upper)).any(axis=1)
+    if outside.any():
+        end, name = ends[outside.argmax()], ("first", "last")[outside.argmax()]
+        return (
+            f"no model of the goal is within the workspace: its {name} particle is at "
+            f"{_metres(end)}, outside {_metres(limits.lower)} to {_metres(limits.upper)}; move "
+            f"the goal, widen lower and upper, or leave fixed_ends out"
+        )
+    reach = np.inf if limits.reach is None else limits.reach[-1]
+    return (
+        f"no model of the goal is within the workspace: its ends are "
+        f"{np.linalg.norm(ends[1] - ends[0]):.3g} m apart, and the model is {reach:.3g} m long at "
+        f"most; raise max_stretch, or leave fixed_ends out"
+    )
+
+
+def _metres(point: Float[np.ndarray, " 3"]) -> str:
+    return f"({', '.join(f'{value:.3g}' for value in point)}) m"
+
+
 def hat_weights(
     num_particles: int, breakpoints: Float[np.ndarray, "B K"] | Int[np.ndarray, "B K"]
 ) -> Float[np.ndarray, "B N K"]:

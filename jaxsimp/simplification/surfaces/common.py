@@ -1,4 +1,4 @@
-"""What the methods for surfaces share: options, boundaries, the choice by Hausdorff distance."""
+"""What the methods for surfaces share: options, normals, the choice by Hausdorff distance."""
 
 from collections.abc import Iterable, Mapping
 
@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.bodies import Body
-from jaxsimp.bodies.meshes import half_edges
 from jaxsimp.goals import Positions, as_goal
 from jaxsimp.simplification.interpolation import interpolation_weights, model_errors
 from jaxsimp.simplification.key_points import FitStatus, KeyPoints, smallest_fit
@@ -40,39 +39,6 @@ def check_surfaces(
     for index, goal in enumerate(goals):
         checked[index] = as_goal(body, goal)
     return checked
-
-
-def boundary(faces: Int[np.ndarray, "F 3"]) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, " E"]]:
-    """Edges of one triangle only, shape (E, 2), as they run in it, and that triangle, shape (E,).
-
-    Args:
-        faces: vertex ids of the triangles, shape (F, 3).
-    """
-    edges, _ = half_edges(faces)
-    _, index, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    alone = index[count == 1]
-    return edges[alone], alone % len(faces)
-
-
-def inner_edges(
-    faces: Int[np.ndarray, "F 3"],
-) -> tuple[Int[np.ndarray, "E 2"], Int[np.ndarray, "E 2"], Int[np.ndarray, "E 2"]]:
-    """Edges of two triangles, the vertices opposite to them, and the triangles, (E, 2) each.
-
-    An edge runs as in its first triangle.
-
-    Args:
-        faces: vertex ids of the triangles, shape (F, 3).
-    """
-    edges, opposite = half_edges(faces)
-    _, where, count = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    order = np.argsort(where, kind="stable")
-    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
-    return edges[pairs[:, 0]], opposite[pairs], pairs % len(faces)
 
 
 def fewest_vertices(

@@ -14,13 +14,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.bodies import Body
+from jaxsimp.bodies.topology import boundary_edges, half_edges, inner_edges, neighbours, rim
 from jaxsimp.goals import Positions
 from jaxsimp.simplification.key_points import FitStatus, KeyPoints, smallest_fit
 from jaxsimp.simplification.surfaces.common import (
     DEFAULT_MAX_SIZE,
-    boundary,
     check_surfaces,
-    inner_edges,
     no_model,
     rest_normals,
 )
@@ -91,30 +90,17 @@ def _sheet(body: Body, goal: Positions, scale: float) -> Sheet:
     area, facing = np.zeros(count), np.zeros((count, 3))
     np.add.at(area, faces, np.linalg.norm(normals, axis=1, keepdims=True) / 3)
     np.add.at(facing, faces, normals[:, None])
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    first, other = neighbours(half_edges(faces)[0], count)
     used = area > 0
     return Sheet(
         rest=(body.rest - body.rest[used].mean(axis=0)) / scale,
         facing=facing,
         goal=(goal - goal[used].mean(axis=0)) / scale,
         area=area / area.sum(),
-        first=np.searchsorted(edges[:, 0], np.arange(count + 1)),
-        other=np.ascontiguousarray(edges[:, 1]),
-        rim=_rim(faces, count),
+        first=first,
+        other=other,
+        rim=rim(faces, count),
     )
-
-
-def _rim(faces: Int[np.ndarray, "F 3"], count: int) -> Int[np.ndarray, "N 2"]:
-    """The two neighbours of each vertex along the boundary, -1 where it is not on it."""
-    edges, _ = boundary(faces)
-    both = np.concatenate([edges, edges[:, ::-1]])
-    both = both[np.lexsort(both.T[::-1])]
-    rim = np.full((count, 2), -1)
-    # Written forwards the last neighbour stays, backwards the first.
-    rim[both[:, 0], 1] = both[:, 1]
-    rim[both[::-1, 0], 0] = both[::-1, 1]
-    return rim
 
 
 def _models(
@@ -165,7 +151,7 @@ def _outline(
     Besides the boundary these are edges where the body turns back on itself, as a flat shirt
     does at its sides: there are two triangles at each.
     """
-    edges, owner = boundary(faces)
+    edges, owner = boundary_edges(faces)
     apex = faces[owner].sum(axis=1) - edges.sum(axis=1)
     inner, apexes, pairs = inner_edges(faces)
     normals = rest_normals(rest, faces)[pairs]

@@ -13,14 +13,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.bodies import Body
+from jaxsimp.bodies.topology import boundary_edges, inner_edges
 from jaxsimp.goals import Positions
 from jaxsimp.simplification.key_points import KeyPoints
 from jaxsimp.simplification.surfaces.common import (
     DEFAULT_MAX_SIZE,
-    boundary,
     check_surfaces,
     fewest_vertices,
-    inner_edges,
 )
 
 MIN_SIZE = 4  # two triangles, where the paper starts
@@ -254,7 +253,7 @@ def _quadrics(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     area = np.linalg.norm(normals, axis=1) / 2
     quadrics = np.zeros((len(points), 4, 4))
     _add_planes(quadrics, points, faces, normals, area)
-    edges, owner = boundary(faces)
+    edges, owner = boundary_edges(faces)
     along = points[edges[:, 1]] - points[edges[:, 0]]
     weight = BOUNDARY_WEIGHT * np.linalg.norm(along, axis=1)
     _add_planes(quadrics, points, edges, np.cross(along, normals[owner]), weight)

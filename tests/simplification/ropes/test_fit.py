@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from jaxsimp.bodies import body
+from jaxsimp import bodies
 from jaxsimp.simplification.qp import SolverStatus
 from jaxsimp.simplification.ropes import fit as rope_fit
 from jaxsimp.simplification.ropes.fit import (
@@ -17,7 +17,7 @@ from jaxsimp.simplification.ropes.fit import (
     limits_of,
 )
 
-ROPE = body.rope(length=1.0)  # 41 particles
+ROPE = bodies.rope(length=1.0)  # 41 particles
 DOUBLE = 1e-12
 EXACT = 1e-7  # metres: ProxQP stops at residuals of 1e-10
 LONG = 2e-6  # metres: `LENGTH_TOLERANCE`, and room

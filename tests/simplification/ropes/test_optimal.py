@@ -5,15 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsimp import goals
-from jaxsimp.bodies import body
+from jaxsimp import bodies, goals
 from jaxsimp.simplification import FitStatus, Workspace, simplify, simplify_batch, simplify_optimal
 from jaxsimp.simplification.key_points import SIZES_BEYOND
 from jaxsimp.simplification.ropes.branch import settle
 from jaxsimp.simplification.ropes.fit import hat_weights
 from jaxsimp.simplification.ropes.search import regression_gains, search, segment_stiffness
 
-ROPE = body.rope(length=1.0)  # 41 particles
+ROPE = bodies.rope(length=1.0)  # 41 particles
 EXACT = 1e-9  # metres: float64, and least squares that square the condition
 KEPT = 2e-6  # metres: constraints, to ProxQP's residuals and `LENGTH_TOLERANCE`
 COUNTS = st.sampled_from([8, 11, 13])  # few, since each is compiled
@@ -22,7 +21,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def small_rope(count):
-    return body.rope(num_particles=count, length=1.0)
+    return bodies.rope(num_particles=count, length=1.0)
 
 
 def random_goal(rng, count):

@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxsimp import goals
-from jaxsimp.bodies import body
+from jaxsimp import bodies, goals
 from jaxsimp.simplification import FitStatus, Workspace, simplify, simplify_batch, simplify_uniform
 from jaxsimp.simplification.key_points import SIZES_BEYOND
 from jaxsimp.simplification.ropes.fit import Limits, fit_within
@@ -17,7 +16,7 @@ from jaxsimp.simplification.ropes.uniform import (
     uniform_breakpoints,
 )
 
-ROPE = body.rope()  # 41 particles, 0.5 m
+ROPE = bodies.rope()  # 41 particles, 0.5 m
 SINGLE = 1e-6  # metres: float32 on coordinates below 1 m, and some room
 DOUBLE = 1e-12
 EXACT = 1e-7  # metres: ProxQP stops at residuals of 1e-10
@@ -234,7 +233,7 @@ def test_no_fit_names_the_best_error_the_tolerance_and_the_remedy():
 
 
 def test_more_key_points_than_particles_are_never_tried():
-    small = body.rope(num_particles=4, length=0.3)
+    small = bodies.rope(num_particles=4, length=0.3)
     goal = np.random.default_rng(5).normal(size=(4, 3))
     (points,) = simplify_uniform(small, goal[None], 1e-3, 50)
     assert points.particles.tolist() == [0, 1, 2, 3]
@@ -262,7 +261,7 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_bad_arguments_are_refused():
-    cloth = body.cloth((3, 3))
+    cloth = bodies.cloth((3, 3))
     with pytest.raises(ValueError, match=r"8 triangles; give a rope"):
         simplify_uniform(cloth, goals.flat(cloth)[None])
     goal = goals.straight(ROPE)

@@ -3,8 +3,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxsimp import goals
-from jaxsimp.bodies import body
+from jaxsimp import bodies, goals
 from jaxsimp.simplification import simplify
 from jaxsimp.simplification.key_points import FitStatus
 from jaxsimp.simplification.surfaces import meshlab
@@ -13,7 +12,7 @@ from jaxsimp.simplification.surfaces.meshlab import decimate, simplify_meshlab
 
 
 def sheet_and_fold(count, direction):
-    sheet = body.cloth((count, count))
+    sheet = bodies.cloth((count, count))
     fold = goals.fold(sheet, goals.flat(sheet), np.zeros(2), np.array(direction, dtype=float))
     return sheet, fold
 
@@ -35,7 +34,7 @@ def test_ids_survive_a_decimation():
     pymeshlab = pytest.importorskip("pymeshlab")
     # Every vertex somewhere else: the mesh that MeshLab made is found again by its coordinates.
     points = np.random.default_rng(0).normal(size=(49, 3))
-    faces = body.cloth((7, 7)).faces
+    faces = bodies.cloth((7, 7)).faces
     triangles = decimate(pymeshlab, points, faces, 20)
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.LinkedMesh(points, faces))
@@ -96,6 +95,6 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_a_rope_is_refused():
-    rope = body.rope()
+    rope = bodies.rope()
     with pytest.raises(ValueError, match="the rope has 0 triangles"):
         simplify_meshlab(rope, goals.straight(rope)[None])

@@ -11,13 +11,13 @@ from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 from experiments.ideal_goals import FOLDS, NOISES, add_noise, ideal_goal, is_right
-from jaxsimp import goals
-from jaxsimp.bodies import body
+from jaxsimp import bodies, goals
+from jaxsimp.bodies.topology import boundary_edges
 from jaxsimp.simplification import simplify, simplify_meshlab, simplify_quadric
 from jaxsimp.simplification.interpolation import interpolation_weights
 from jaxsimp.simplification.key_points import FitStatus
 from jaxsimp.simplification.surfaces import parametric
-from jaxsimp.simplification.surfaces.common import boundary, rest_normals
+from jaxsimp.simplification.surfaces.common import rest_normals
 from jaxsimp.simplification.surfaces.parametric import simplify_parametric
 
 ROUNDING = 1e-9  # metres, of sums over some hundred particles of a sheet of 0.3 m
@@ -27,7 +27,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 @cache
 def cloth(count, other=None):
-    return body.cloth((count, other or count), (0.3, 0.3 * (other or count) / count))
+    return bodies.cloth((count, other or count), (0.3, 0.3 * (other or count) / count))
 
 
 def robust(sheet, goal, **options):
@@ -40,13 +40,14 @@ def mesh_body(rest, faces):
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     springs = np.unique(edges, axis=0)
     lengths = np.linalg.norm(rest[springs[:, 1]] - rest[springs[:, 0]], axis=1)
-    plain = body.cloth((3, 3))
+    plain = bodies.cloth((3, 3))
     return replace(
         plain,
         name="mesh",
         rest=rest.copy(),
         mass=np.full(len(rest), 1e-4),
         springs=springs,
+        families=np.zeros(len(springs), dtype=int),
         rest_length=lengths,
         stiffness=np.ones(len(springs)),
         damping=np.ones(len(springs)),
@@ -116,7 +117,7 @@ def test_a_flat_sheet_has_its_corners():
 
 
 def test_the_default_tolerance_is_a_tenth_of_the_side_of_a_square_of_its_area():
-    strip = body.cloth((5, 17), (0.1, 0.4))
+    strip = bodies.cloth((5, 17), (0.1, 0.4))
     assert robust(strip, goals.flat(strip)).tolerance == pytest.approx(0.02)
 
 
@@ -166,7 +167,7 @@ def test_models_of_every_size_are_discs_that_cover_the_sheet(seed):
     for size, model in models.items():
         faces = model.vertices[model.triangles]
         assert size == len(model.vertices) == len(np.unique(faces))
-        edges, _ = boundary(faces)
+        edges, _ = boundary_edges(faces)
         assert len(faces) == 2 * size - 2 - len(edges)  # Euler: a disc
         areas = signed_areas(sheet.rest, faces)
         assert areas.min() > 0
@@ -285,7 +286,7 @@ def test_a_closed_surface_stays_closed_down_to_four_points():
 def test_two_sides_that_coincide_at_rest_are_kept_apart():
     """A pillow: two sheets sewn at their rims, at rest upon each other; the upper one is lifted."""
     sheet = cloth(9)
-    rim = np.unique(boundary(sheet.faces)[0])
+    rim = np.unique(boundary_edges(sheet.faces)[0])
     inner = np.setdiff1d(np.arange(81), rim)
     upper = np.arange(81)
     upper[inner] = 81 + np.arange(len(inner))
@@ -349,7 +350,7 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_a_rope_is_refused():
-    rope = body.rope()
+    rope = bodies.rope()
     with pytest.raises(ValueError, match="the rope has 0 triangles; give a body with triangles"):
         robust(rope, goals.straight(rope))
 

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxsimp import goals
-from jaxsimp.bodies import body
+from jaxsimp import bodies, goals
 from jaxsimp.simplification import simplify
 from jaxsimp.simplification.key_points import FitStatus
 from jaxsimp.simplification.surfaces.hausdorff import Surface, hausdorff_distance
@@ -30,7 +29,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 @cache
 def cloth(count):
-    return body.cloth((count, count))
+    return bodies.cloth((count, count))
 
 
 def quadric(sheet, goal, **options):
@@ -308,6 +307,6 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_bad_arguments_are_refused():
-    rope = body.rope()
+    rope = bodies.rope()
     with pytest.raises(ValueError, match="the rope has 0 triangles; give a body with triangles"):
         quadric(rope, goals.straight(rope))

@@ -42,6 +42,21 @@ def rollout(
         The state at the end of the last action, and the observations stacked along a first
         axis of length T; by default the positions, shape (T, N, 3).
     """
+    return rollout_observing(
+        simulation, pickers, state, actions, lambda state, _: observe(state), adjoint=adjoint
+    )
+
+
+def rollout_observing(
+    simulation: Simulation,
+    pickers: Pickers,
+    state: State,
+    actions: Actions,
+    observe: Callable[[State, Actions], PyTree[Any]],
+    *,
+    adjoint: bool = True,
+) -> tuple[State, PyTree[Any]]:
+    """`rollout`, but `observe` is applied to the state at the end of each action and the action."""
     advance = steps if adjoint else plain_steps
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
@@ -49,7 +64,7 @@ def rollout(
         held, displacement = grasp(pickers, simulation.rest, simulation.radius, position, action)
         motion = Motion(held, displacement.T / simulation.time_step)
         moving = touching_steps(advance, simulation, moving, motion, speed_profile(pickers.steps))
-        return moving, observe(end(simulation, moving))
+        return moving, observe(end(simulation, moving), action)
 
     moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
     return end(simulation, moving), observations

@@ -2,7 +2,7 @@
 
 On a CPU it is fastest to give every core its share of the population, and to run that share in
 chunks small enough for their state to stay in the cache, each through its whole rollout (under
-`vmap`, time steps run with the batch as last axis, see adjoint.py). On a GPU the whole population
+`vmap`, time steps run with the batch as last axis, see batching.py). On a GPU the whole population
 in one `vmap` is. See `Layout`.
 """
 
@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from jaxsimp.dynamics import Simulation
 from jaxsimp.machine import num_cores
 
 
@@ -46,32 +45,22 @@ class Layout:
             )
 
 
-CHUNK_SIZE = 8
-"""Samples a chunk on a CPU, whatever the number of workers: a sample's chunk decides how it rounds,
-so plans do not depend on how many cores or devices there are. Larger chunks are within a fifth."""
-MOST_CHUNKED_PARTICLES = 1000
-"""Grids and ropes of more run sample by sample: the states of a chunk would leave the cache."""
-
-
-def default_layout(population: int, simulation: Simulation) -> Layout:
+def default_layout(population: int, chunk_size: int) -> Layout:
     """The layout measured to be fastest for a population of rollouts.
 
-    On a CPU every core takes a share, in chunks, or sample by sample where that is as fast; on
-    anything else every device takes a share in one `vmap`.
+    On a CPU every core takes a share, in chunks; on anything else every device takes a share in
+    one `vmap`.
 
     Args:
         population: rollouts at a time.
-        simulation: of the body.
+        chunk_size: rollouts that run fastest under one `vmap` on a core of a CPU, see
+            `SearchEngine.chunk_size`.
     """
     devices = jax.local_devices()
     if devices[0].platform != "cpu":
         return Layout(chunk_size=-(-population // len(devices)), num_workers=len(devices))
-    large = simulation.springs.offsets and len(simulation.mass) > MOST_CHUNKED_PARTICLES
-    # Only a sample by itself looks its contacts up no more often than it must.
-    alone = large or simulation.self_contact is not None
     return Layout(
-        chunk_size=1 if alone else min(CHUNK_SIZE, population),
-        num_workers=max(num_cores(), len(devices)),
+        chunk_size=min(chunk_size, population), num_workers=max(num_cores(), len(devices))
     )
 
 

@@ -1,4 +1,4 @@
-"""Tasks: costs in closed form, symmetries of the costs, the start states, the registry."""
+"""Costs of tasks: in closed form, their symmetries, matching distances, gradients."""
 
 from functools import lru_cache
 
@@ -11,12 +11,9 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from jaxsimp import goals, tasks
-from jaxsimp.bodies import rope
-from jaxsimp.dynamics import at_rest, make_simulation, settle
-from jaxsimp.tasks import Episode, Task, crumple, matching_distance, score, task_names
+from jaxsimp.dynamics import at_rest
+from jaxsimp.tasks import Episode, Task, matching_distance, task_names
 
-ROPES = ("rope_straightening", "rope_folding")
-GARMENTS = ("t_shirt_sleeves_in", "trousers_leg_over_leg")
 FOLDS = ("cloth_side_folding", "cloth_diagonal_folding")
 # Costs are means of at most 400 float32 distances of up to 0.5 m: rounding adds up to some
 # 1e-7 relative an operation, far below this.
@@ -31,7 +28,12 @@ jit_matching = jax.jit(matching_distance)
 
 @lru_cache(None)
 def jit_cost(task: Task):
-    return jax.jit(task.cost_fn)
+    return jax.jit(position_cost(task))
+
+
+def position_cost(task: Task):
+    """The terminal cost as a function of positions, at rest."""
+    return lambda episode, position: task.terminal_cost(episode, at_rest(position))
 
 
 def cost_of(task: Task, episode: Episode, position: np.ndarray) -> float:
@@ -121,40 +123,6 @@ def test_dragging_the_half_that_should_lie_still_costs_its_weight(name):
     assert after - before == pytest.approx(1.2 * 0.05, rel=1e-5)  # a difference: some digits go
 
 
-# --- scores ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", task_names())
-def test_score_is_0_at_the_start_and_near_1_at_the_goal(name):
-    task = make_task(name, quick=True)
-    episode = task.episode_fn(2)
-    start, goal = (jnp.asarray(p, dtype=float) for p in (episode.start, episode.goal))
-    assert float(score(task, episode, start)) == 0.0
-    # A rope reaches its goal exactly. The layers of a fold stay a thickness (4 mm) apart.
-    gap = 2 * task.body.radius / cost_of(task, episode, start) if name in FOLDS else 0.0
-    assert 1 - gap - ROUNDING <= float(score(task, episode, goal)) <= 1.0
-
-
-@pytest.mark.parametrize("name", FOLDS)
-def test_score_is_1_for_the_ideal_fold(name):
-    # The moving half exactly on its images, which have not moved.
-    task = make_task(name, quick=True)
-    episode = task.episode_fn(4)
-    ideal = np.array(episode.goal)
-    ideal[:, 2] = episode.start[:, 2]
-    assert float(score(task, episode, jnp.asarray(ideal, dtype=float))) == pytest.approx(
-        1.0,
-        abs=1e-5,  # images coincide to the rounding of coordinates, 1e-8 m of 0.14 m
-    )
-
-
-def test_a_worse_state_than_the_start_scores_below_0():
-    task = make_task("cloth_side_folding", quick=True)
-    episode = task.episode_fn(0)
-    dragged = jnp.asarray(episode.start + np.array([0.5, 0.0, 0.0]), dtype=float)
-    assert float(score(task, episode, dragged)) < -1
-
-
 # --- symmetries -----------------------------------------------------------------------------------
 
 
@@ -167,23 +135,6 @@ def test_cost_does_not_change_when_everything_is_turned(name, angle, seed):
     position = moved(task, seed, 0.02)
     expected = cost_of(task, episode, position)
     assert cost_of(task, turned, goals.turn(position, angle)) == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize("name", FOLDS)
-def test_episodes_are_turned_by_random_angles_up_to_45_degrees(name):
-    task = make_task(name, quick=True)
-    angles = []
-    for seed in range(40):
-        episode = task.episode_fn(seed)
-        edge = episode.start[-1] - episode.start[0]
-        angle = np.arctan2(edge[1], edge[0]) - np.pi / 4  # the diagonal of a square at rest
-        angles.append((angle + np.pi) % (2 * np.pi) - np.pi)
-        np.testing.assert_allclose(episode.start, goals.flat(task.body, angles[-1]), atol=1e-12)
-        np.testing.assert_allclose(episode.goal, goals.turn(task.goal, angles[-1]), atol=1e-12)
-    assert np.max(np.abs(angles)) <= np.pi / 4
-    # 40 uniform draws all miss an eighth of the range at either end once in 10^2.
-    assert min(angles) < -np.pi / 8 < np.pi / 8 < max(angles)
-    assert len(set(angles)) == 40
 
 
 @pytest.mark.parametrize("resolution", [5, 6, 9])
@@ -213,7 +164,7 @@ def test_mirror_pairs_are_reflections_of_the_rest_coordinates(name, normal, reso
 def test_rope_folding_compares_11_particles_end_to_end():
     task = make_task("rope_folding", 41)
     episode = task.episode_fn(0)
-    gradient = jax.grad(task.cost_fn, argnums=1)(episode, jnp.asarray(moved(task, 0, 0.05)))
+    gradient = jax.grad(position_cost(task), argnums=1)(episode, jnp.asarray(moved(task, 0, 0.05)))
     compared = np.flatnonzero(np.linalg.norm(gradient, axis=1))
     np.testing.assert_array_equal(compared, np.arange(0, 41, 4))
 
@@ -275,7 +226,7 @@ def test_positions_that_are_not_finite_have_no_finite_cost(name, bad):
 def test_gradients_are_finite_at_the_start_at_the_goal_and_where_points_coincide(name):
     task = make_task(name, quick=True)
     episode = task.episode_fn(0)
-    gradient_fn = jax.jit(jax.grad(task.cost_fn, argnums=1))
+    gradient_fn = jax.jit(jax.grad(position_cost(task), argnums=1))
     for position in (episode.start, episode.goal, np.zeros_like(task.body.rest)):
         gradient = gradient_fn(episode, jnp.asarray(position, dtype=float))
         assert np.all(np.isfinite(gradient))
@@ -286,149 +237,9 @@ def test_gradients_are_those_of_finite_differences(name, x64):
     task = tasks.make_task(name, 5)  # not one that a float32 test has traced
     episode = task.episode_fn(0)
     position, along = jnp.asarray(moved(task, 2, 0.05)), jnp.asarray(cloud(3, len(task.goal)))
-    _, slope = jax.jvp(lambda p: task.cost_fn(episode, p), (position,), (along,))
+    _, slope = jax.jvp(lambda p: position_cost(task)(episode, p), (position,), (along,))
     ahead, behind = (cost_of(task, episode, position + h * along) for h in (1e-6, -1e-6))
     # Central differences: error of h^2 times a third derivative of 1/(5 cm)^2, and 1e-16 / h.
     assert float(slope) == pytest.approx((ahead - behind) / 2e-6, rel=1e-6, abs=1e-9)
-    gradient = jax.grad(task.cost_fn, argnums=1)(episode, position)
+    gradient = jax.grad(position_cost(task), argnums=1)(episode, position)
     assert float(jnp.vdot(gradient, along)) == pytest.approx(float(slope), rel=1e-12)
-
-
-# --- crumpled ropes -------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def crumpled():
-    """A short rope and what it looks like after four picks, for three seeds."""
-    body = rope(11, tasks.rope.ROPE_LENGTH)
-    return body, [crumple(body, seed) for seed in range(3)]
-
-
-def test_a_crumpled_rope_is_the_same_for_the_same_seed_only(crumpled):
-    body, shapes = crumpled
-    np.testing.assert_array_equal(crumple(body, 1), shapes[1])
-    again = rope(11, tasks.rope.ROPE_LENGTH)  # an equal body, compiled anew
-    np.testing.assert_array_equal(crumple(again, 1), shapes[1])
-    for first, second in [(0, 1), (0, 2), (1, 2)]:
-        assert np.abs(shapes[first] - shapes[second]).max() > 0.05
-
-
-def test_a_crumpled_rope_lies_on_the_table_at_rest(crumpled):
-    body, shapes = crumpled
-    simulation = make_simulation(body, 1e-3, self_contact=True)
-    for position in shapes:
-        assert position[:, 2].min() >= body.radius - 1e-6  # float32 rounding of a step
-        later = settle(simulation, at_rest(position), 300)
-        # Not a pose of a moment: left alone it stays, to a twentieth of the spacing.
-        assert np.abs(later.position - position).max() < body.spacing / 20
-
-
-@pytest.mark.slow
-def test_parts_of_a_crumpled_rope_lie_on_each_other():
-    body = rope(41, tasks.rope.ROPE_LENGTH)
-    stacked = 0
-    for seed in range(4):
-        position = crumple(body, seed).astype(float)
-        # Ten points on each segment; those nearer along the rope than it can bend are left out.
-        along = np.linspace(0, 40, 401)
-        points = np.stack([np.interp(along, np.arange(41), axis) for axis in position.T], axis=1)
-        apart = np.linalg.norm(points[:, None] - points, axis=2)
-        apart[np.abs(along[:, None] - along) < 3] = np.inf
-        assert apart.min() > 0.8 * 2 * body.radius
-        stacked += position[:, 2].max() > 2 * body.radius
-    assert stacked > 0
-
-
-def test_a_crumpled_rope_is_not_overstretched_and_not_straight(crumpled):
-    body, shapes = crumpled
-    # At rest on the table friction holds a tension of at most mu m g: with the 150 N/m of a
-    # spring between neighbours that is 0.65 mm.
-    allowed = body.friction * body.mass.sum() * 9.81 / 150.0
-    for position in shapes:
-        lengths = np.linalg.norm(np.diff(position, axis=0), axis=1)
-        assert np.all(lengths <= body.spacing + allowed)
-        assert np.linalg.norm(position[-1] - position[0]) < 0.97 * body.size
-
-
-def test_straightening_starts_crumpled():
-    task = make_task("rope_straightening", 11)
-    episode = task.episode_fn(1)
-    np.testing.assert_array_equal(episode.start, crumple(task.body, 1))
-    np.testing.assert_array_equal(episode.goal, task.goal)
-
-
-# --- the registry ---------------------------------------------------------------------------------
-
-
-def test_the_four_tasks_of_the_paper_are_registered():
-    assert set(task_names("paper")) == {*ROPES, *FOLDS}
-
-
-def test_groups_are_all_tasks():
-    assert set(task_names()) == {*task_names("paper"), *task_names("goals")}
-    assert len(task_names("goals")) == 8
-    assert task_names("none") == ()
-
-
-@pytest.mark.parametrize("name", task_names())
-@pytest.mark.parametrize("resolution", [5, 6, 13])
-def test_tasks_have_other_resolutions(name, resolution):
-    task = make_task(name, resolution)
-    if name in GARMENTS:
-        assert task.body.num_particles == pytest.approx(resolution**2, rel=0.15)
-    else:
-        assert task.body.shape == (resolution,) * len(task.body.shape)
-    assert task.goal.shape == task.body.rest.shape
-    simulation = task.simulation()
-    assert float(simulation.time_step) == pytest.approx(task.time_step, rel=1e-6)
-    seconds = task.action_steps * task.time_step
-    assert seconds == pytest.approx(task.action_seconds, abs=task.time_step / 2)  # whole steps
-
-
-@pytest.mark.parametrize("name", task_names())
-def test_scales(name):
-    full, quick = make_task(name), make_task(name, quick=True)
-    assert quick.body.num_particles < full.body.num_particles
-    assert make_task(name, 7, quick=True).body.num_particles < quick.body.num_particles
-    assert full.name == name
-
-
-def test_unknown_task_names_the_choices():
-    with pytest.raises(ValueError, match=r"unknown task 'rope_tying'.*rope_folding"):
-        make_task("rope_tying")
-
-
-@pytest.mark.parametrize("resolution", [4, 1, 0, -3])
-def test_low_resolution_is_refused(resolution):
-    with pytest.raises(ValueError, match=f"resolution is {resolution}; .* at least 5"):
-        make_task("rope_folding", resolution)
-
-
-def test_a_name_is_taken_once(monkeypatch):
-    monkeypatch.setattr(tasks.task, "_REGISTRY", dict(tasks.task._REGISTRY))
-    with pytest.raises(ValueError, match="'rope_folding' is registered already"):
-        tasks.register("rope_folding", full=9, quick=5)
-    made = []
-
-    @tasks.register("mine", full=9, quick=6)
-    def mine(resolution):
-        made.append(resolution)
-        return make_task("rope_folding", resolution)
-
-    assert "mine" in task_names()
-    for choice in ({}, {"quick": True}, {"resolution": 7}):
-        make_task("mine", **choice)
-    assert made == [9, 6, 7]
-
-
-def test_a_goal_that_does_not_fit_is_refused():
-    task = make_task("rope_folding", 9)
-    with pytest.raises(ValueError, match=r"goal of particle 0 is .* give finite coordinates"):
-        Task(
-            name="broken",
-            body=task.body,
-            goal=np.full((9, 3), np.nan),
-            episode_fn=task.episode_fn,
-            cost_fn=task.cost_fn,
-            limits=task.limits,
-        )

@@ -1,0 +1,125 @@
+"""Options that studies of plans share."""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from rich.console import Console
+
+from experiments.plans import ACTION_SPACES, PlanStudy, run_study
+from experiments.study import default_folder, told_done
+from jaxsimp import records
+from jaxsimp.planning import ENCODINGS
+from jaxsimp.tasks import make_task, task_names
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of studies of plans."""
+
+    NAME: ClassVar[str]
+    SUCCESS_SCORE: ClassVar[float] = 0.9
+
+    tasks: tuple[str, ...] = task_names()
+    """Tasks to plan for."""
+    method: str = "robust"
+    """How goals are simplified: robust, paper or meshlab."""
+    action_spaces: tuple[str, ...] = ACTION_SPACES
+    """Particles that may be grasped."""
+    pick_encodings: tuple[str, ...] = ("categorical", "gaussian_index")
+    """How CEM encodes what is grasped."""
+    seeds: int = 10
+    """Seeds 0 to SEEDS - 1 of each combination."""
+    resolution: int | None = None
+    """Particles along the rope or a side of the cloth (default: 41 and 25)."""
+    budget: Literal["default", "paper", "goals"] = "default"
+    """Search settings: those that end in minutes, the paper's own, or more for several folds."""
+    num_iterations: int | None = None
+    """CEM rounds, instead of the budget's."""
+    population: int | None = None
+    """Plans drawn a round, instead of the budget's."""
+    initial_populations: int | None = None
+    """Populations drawn in the first CEM round, instead of the budget's."""
+    elite_fraction: float | None = None
+    """Share of the population that are elites, instead of the budget's."""
+    smoothing: float | None = None
+    """Share of the old distribution kept in an update, instead of the budget's."""
+    initial_spread: float | None = None
+    """First deviation of displacements in units of their limits, instead of the budget's."""
+    keep_best: bool | None = None
+    """Whether the best plan so far stays among the elites, instead of the budget's."""
+    returns: Literal["best", "mean"] | None = None
+    """The best plan drawn, or the mean of the last distribution, instead of the budget's."""
+    num_actions: int | None = None
+    """Actions in a plan (the horizon), instead of the budget's."""
+    planning: Literal["nominal", "robust", "self_contact", "mixed"] = "nominal"
+    """What the search judges plans in: the body's physics alone, an ensemble of them, the body
+    touching itself, or the last for cloths and the first for ropes."""
+    self_contact: bool = True
+    """Carry out and score plans that were found with the body touching itself."""
+    out: Path | None = None
+    """Output folder (default: results/paper, or results/paper-smoke)."""
+    smoke: bool = False
+    """Small bodies, few rollouts, two seeds: everything once, in under two minutes."""
+    list: bool = False
+    """List the tasks, action spaces and encodings, and end."""
+
+    def configuration(self) -> PlanStudy:
+        """The study that these options ask for.
+
+        Raises:
+            ValueError: if an option has a value that it cannot have.
+        """
+        names = [
+            field.name
+            for field in dataclasses.fields(PlanOptions)
+            if field.default is None and field.name not in ("resolution", "num_actions", "out")
+        ]
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return PlanStudy(
+            name=self.NAME,
+            tasks=self.tasks,
+            method=self.method,
+            success_score=self.SUCCESS_SCORE,
+            action_spaces=self.action_spaces,
+            pick_encodings=self.pick_encodings,
+            seeds=min(self.seeds, 2) if self.smoke else self.seeds,
+            quick=self.smoke,
+            resolution=self.resolution,
+            budget="smoke" if self.smoke else self.budget,
+            settings=given,
+            num_actions=self.num_actions,
+            planning=self.planning,
+            self_contact=self.self_contact,
+        )
+
+    def run(self, console: Console) -> None:
+        """Run the study, or list what it can be asked for."""
+        if self.list:
+            _list(console)
+            return
+        study, folder = self.configuration(), self.folder()
+        records.open_folder(folder, study.identity())
+        # Here, so that --help and wrong options do not wait for matplotlib.
+        from experiments.plan_report import write_report
+
+        start = time.perf_counter()
+        write_report(study, run_study(study, folder, console), folder)
+        told_done(console, folder, start)
+
+    def folder(self) -> Path:
+        """Where results go."""
+        name = self.NAME
+        if self.planning != type(self).planning:
+            name += f"-{self.planning}"
+        return self.out or default_folder(name, self.smoke)
+
+
+def _list(console: Console) -> None:
+    for name in task_names():
+        task = make_task(name)
+        console.print(f"task {name}: {task.body.name}, {task.body.num_particles} particles")
+    console.print(f"action spaces: {', '.join(ACTION_SPACES)}")
+    console.print(f"pick encodings: {', '.join(ENCODINGS)}")

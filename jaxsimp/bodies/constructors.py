@@ -1,0 +1,265 @@
+"""Constructors of bodies: ropes, rectangular cloths, and sheets from triangle meshes.
+
+Each takes a material, by default that of its kind in `MATERIALS`, and parameters in which the body
+differs from it.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxsimp.bodies.body import Body
+from jaxsimp.bodies.checks import require_count, require_finite, require_positive
+from jaxsimp.bodies.material import FAMILIES, MATERIALS, Material
+from jaxsimp.bodies.meshes import clean_mesh, face_areas, spring_weights
+from jaxsimp.bodies.topology import chain
+
+MASS = 0.02
+"""Default mass of a rope and of a cloth, whatever its size, kilograms."""
+
+
+def rope(
+    num_particles: int = 41,
+    length: float = 0.5,
+    *,
+    mass: float | None = None,
+    material: Material | None = None,
+    **changes: float,
+) -> Body:
+    """A rope: particles in a line along x, as in SoftGym.
+
+    Args:
+        num_particles: number of particles, at least 2.
+        length: rest length, metres.
+        mass: of the whole rope, kilograms; it replaces the material's density. By default `MASS`,
+            or the density times the length where a material or a density is given.
+        material: `MATERIALS["rope"]` by default.
+        changes: parameters in which the rope differs from the material, as `drag=2.0`.
+
+    Raises:
+        ValueError: if a number is out of its range, or both a mass and a density are given.
+        TypeError: if `Material` has no parameter of a name in `changes`.
+    """
+    require_count("num_particles", num_particles, 2)
+    require_positive("length", length)
+    rest = np.zeros((num_particles, 3))
+    rest[:, 0] = np.linspace(-length / 2, length / 2, num_particles)
+    return rope_along(rest, mass=mass, material=material, **changes)
+
+
+def rope_along(
+    points: Float[np.ndarray, "N 3"],
+    *,
+    mass: float | None = None,
+    material: Material | None = None,
+    **changes: float,
+) -> Body:
+    """A rope that is at rest along given points, which need not be evenly spread.
+
+    Args:
+        points: of the particles in order, shape (N, 3), metres; N is at least 2.
+        mass: as for `rope`.
+        material: as for `rope`.
+        changes: as for `rope`.
+
+    Raises:
+        ValueError: if a number is out of its range, or particles joined by a spring coincide.
+        TypeError: if `Material` has no parameter of a name in `changes`.
+    """
+    count = len(points)
+    require_count("num_particles", count, 2)
+    require_finite("points", points)
+    segments = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    require_positive("rest_length", segments)
+    made, mass = _weigh("rope", material, changes, mass, float(segments.sum()))
+    _refuse_shear("rope", made)
+    no_springs, no_faces = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3), dtype=np.int64)
+    springs = (chain(count), no_springs, chain(count, 2))
+    return _mass_spring("rope", _on_the_table(points), springs, no_faces, made, mass, (count,))
+
+
+def cloth(
+    shape: tuple[int, int] = (25, 25),
+    size: tuple[float, float] = (0.3, 0.3),
+    *,
+    mass: float | None = None,
+    material: Material | None = None,
+    **changes: float,
+) -> Body:
+    """A rectangular cloth: a grid of particles, row by row, with the springs of SoftGym.
+
+    Stretch springs join the four neighbours, shear springs the diagonals, bend springs the
+    particles two apart. Particle `i * shape[1] + j` is at row `i` (along x), column `j`
+    (along y).
+
+    Args:
+        shape: number of rows and of columns, each at least 2.
+        size: extent along x and along y, metres.
+        mass: of the whole cloth, kilograms; it replaces the material's density. By default
+            `MASS`, or the density times the area where a material or a density is given.
+        material: `MATERIALS["cloth"]` by default.
+        changes: parameters in which the cloth differs from the material, as `drag=2.0`.
+
+    Raises:
+        ValueError: if a number is out of its range, or both a mass and a density are given.
+        TypeError: if `Material` has no parameter of a name in `changes`.
+    """
+    for count, extent in zip(shape, size, strict=True):
+        require_count("shape", count, 2)
+        require_positive("size", extent)
+    made, mass = _weigh("cloth", material, changes, mass, size[0] * size[1])
+    rows, columns = shape
+    grid = np.arange(rows * columns).reshape(shape)
+    x = np.linspace(-size[0] / 2, size[0] / 2, rows)
+    y = np.linspace(-size[1] / 2, size[1] / 2, columns)
+    rest = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros(shape)], axis=-1).reshape(-1, 3)
+    return _mass_spring("cloth", rest, _grid_springs(grid), _grid_faces(grid), made, mass, shape)
+
+
+def from_mesh(
+    points: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    *,
+    name: str = "mesh",
+    scale: float = 1.0,
+    material: Material = MATERIALS["mesh"],
+    **changes: float,
+) -> Body:
+    """A sheet of any shape: particles at the points of a triangle mesh.
+
+    The mesh is cleaned first (see `jaxsimp.bodies.meshes.clean_mesh`): particles are its points in
+    their order, without copies and points of no triangle. It is at rest as it is given, its
+    lowest point put at z = 0, centred along x and y. A particle has a third of the mass of
+    each of its triangles.
+
+    Stretch springs lie along the edges, bend springs across each edge of two triangles, from
+    corner to corner. Stiffness and damping are the sheet's, shared out by the weights of
+    `jaxsimp.bodies.meshes.spring_weights`, so that in its plane the sheet does not depend to first
+    order on how finely it is meshed. On equilateral triangles its Young's modulus times
+    thickness is the sum of both stiffnesses. Out of the plane only bend springs that shorten
+    resist: that is of higher order, and weaker in a finer mesh, as in `cloth`.
+
+    Very unequal or slender triangles ask for a small time step; `jaxsimp.bodies.outlines.remesh`
+    replaces those of a flat mesh.
+
+    Args:
+        points: shape (V, 3), metres over `scale`, z up.
+        faces: point ids of the triangles, shape (F, 3).
+        name: of the kind of body.
+        scale: metres in one unit of `points`: 0.001 for millimetres.
+        material: of the sheet.
+        changes: parameters in which the sheet differs from the material, as `density=0.3`.
+
+    Raises:
+        ValueError: if the mesh is refused (see `clean_mesh`), or a number is out of its range.
+        TypeError: if `Material` has no parameter of a name in `changes`.
+    """
+    material = material.changed(**changes)
+    _refuse_shear(name, material)
+    points, faces = clean_mesh(points, faces, scale=scale)
+    (edges, along), (pairs, across) = spring_weights(points, faces)
+    springs, weight = np.concatenate([edges, pairs]), np.concatenate([along, across])
+    third = np.repeat(face_areas(points, faces) / 3, 3)
+    stretch, bend = material.stretch_stiffness * along, material.bend_stiffness * across
+    return Body(
+        name=name,
+        rest=_on_the_table(points),
+        mass=material.density * np.bincount(faces.ravel(), weights=third),
+        springs=springs,
+        families=_family_ids([len(edges), 0, len(pairs)]),
+        rest_length=np.linalg.norm(points[springs[:, 1]] - points[springs[:, 0]], axis=1),
+        stiffness=np.concatenate([stretch, bend]),
+        damping=material.damping * weight,
+        faces=faces,
+        material=material,
+        shape=(len(points),),
+    )
+
+
+def _weigh(
+    kind: str,
+    material: Material | None,
+    changes: dict[str, float],
+    mass: float | None,
+    extent: float,
+) -> tuple[Material, float]:
+    """The material and the mass, kilograms, of a body.
+
+    The extent is its length, metres, or its area, square metres.
+    """
+    if mass is not None and "density" in changes:
+        raise ValueError(
+            f"mass is {mass:g} and density is {changes['density']:g}; give one of them, the other "
+            f"follows from the size"
+        )
+    made = (material or MATERIALS[kind]).changed(**changes)
+    if mass is None and (material is not None or "density" in changes):
+        return made, made.density * extent
+    mass = MASS if mass is None else mass
+    require_positive("mass", mass)
+    return made.changed(density=mass / extent), mass
+
+
+def _refuse_shear(name: str, material: Material) -> None:
+    if material.shear_stiffness:
+        raise ValueError(
+            f"shear_stiffness is {material.shear_stiffness:g}; a {name} has no shear springs: "
+            f"give 0"
+        )
+
+
+def _mass_spring(
+    name: str,
+    rest: np.ndarray,
+    families: tuple[np.ndarray, ...],
+    faces: np.ndarray,
+    material: Material,
+    mass: float,
+    shape: tuple[int, ...],
+) -> Body:
+    """A body of equal particles, the springs of a family alike."""
+    springs, sizes = np.concatenate(families), [len(pairs) for pairs in families]
+    return Body(
+        name=name,
+        rest=rest,
+        mass=np.full(len(rest), mass / len(rest)),
+        springs=springs,
+        families=_family_ids(sizes),
+        rest_length=np.linalg.norm(rest[springs[:, 1]] - rest[springs[:, 0]], axis=1),
+        stiffness=np.repeat([getattr(material, name) for name in FAMILIES], sizes),
+        damping=np.full(len(springs), material.damping),
+        faces=faces,
+        material=material,
+        shape=shape,
+    )
+
+
+def _family_ids(sizes: list[int]) -> Int[np.ndarray, " S"]:
+    """For each spring the index of its family in `FAMILIES`, from the sizes of the families."""
+    return np.repeat(np.arange(len(FAMILIES)), sizes)
+
+
+def _on_the_table(points: np.ndarray) -> np.ndarray:
+    """Points moved so that the lowest is at z = 0, and the middle of their extent above it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return points - np.array([*(low + high)[:2] / 2, low[2]])
+
+
+def _pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.stack([first.ravel(), second.ravel()], axis=1)
+
+
+def _grid_springs(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of particles that stretch, shear and bend springs join, shape (_, 2) each."""
+    stretch = [_pairs(grid[:-1], grid[1:]), _pairs(grid[:, :-1], grid[:, 1:])]
+    shear = [_pairs(grid[:-1, :-1], grid[1:, 1:]), _pairs(grid[:-1, 1:], grid[1:, :-1])]
+    bend = [_pairs(grid[:-2], grid[2:]), _pairs(grid[:, :-2], grid[:, 2:])]
+    return np.concatenate(stretch), np.concatenate(shear), np.concatenate(bend)
+
+
+def _grid_faces(grid: np.ndarray) -> np.ndarray:
+    """Two triangles a cell, counter-clockwise seen from above, shape (F, 3)."""
+    corner, right = grid[:-1, :-1].ravel(), grid[1:, :-1].ravel()
+    up, across = grid[:-1, 1:].ravel(), grid[1:, 1:].ravel()
+    return np.concatenate(
+        [np.stack([corner, right, up], axis=1), np.stack([right, across, up], axis=1)]
+    )

@@ -1,0 +1,132 @@
+"""Materials: the physical parameters of a body, in one place.
+
+A new parameter of the body is a field of `Material`; if calibrations can fit it and ensembles can
+vary it, its name stands in `PARAMETERS`, too.
+"""
+
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
+
+from jaxsimp.bodies.checks import require_at_least_zero, require_positive
+
+FAMILIES = ("stretch_stiffness", "shear_stiffness", "bend_stiffness")
+"""Families of springs, by the name of their stiffness; `Body.families` has indices in this."""
+PARAMETERS = ("stiffness", "damping", "drag", "friction")
+"""Parameters that calibrations fit and ensembles vary; `stiffness` stands for all `FAMILIES`."""
+FACTORS = ("mass", *PARAMETERS, "thickness")
+"""Parameters that `Material.scaled` and `Body.scaled` multiply; `mass` stands for the density."""
+GROUPS = MappingProxyType({"mass": ("density",), "stiffness": FAMILIES})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """The physical parameters of a body, whatever its shape and size.
+
+    Attributes:
+        density: mass of a rope per length, kilograms per metre; mass of a sheet per area,
+            kilograms per square metre.
+        stretch_stiffness: newtons per metre. Of a rope or a cloth: of each spring between
+            neighbours. Of a mesh: of the sheet, shared out over the springs along edges.
+        shear_stiffness: newtons per metre, of each spring along a diagonal of a cloth's cell.
+            Ropes and meshes have no such springs, and need 0.
+        bend_stiffness: newtons per metre. Of a rope or a cloth: of each spring between particles
+            two apart. Of a mesh: of the sheet, shared out over the springs across edges.
+        damping: force per rate of elongation, newton-seconds per metre. Of a rope or a cloth: of
+            each spring. Of a mesh: of the sheet, shared out over all springs.
+        drag: rate at which the air slows every particle, per second: dv/dt = -drag v.
+        friction: Coulomb coefficient between the body and the table.
+        thickness: metres; a particle rests on the table at half of it.
+
+    Raises:
+        ValueError: if the density is not a finite number above zero, or another parameter is not
+            a finite number of zero or more.
+    """
+
+    density: float
+    stretch_stiffness: float
+    shear_stiffness: float = 0.0
+    bend_stiffness: float
+    damping: float
+    drag: float
+    friction: float
+    thickness: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            require = require_positive if field.name == "density" else require_at_least_zero
+            require(field.name, getattr(self, field.name))
+
+    def changed(self, **values: float) -> "Material":
+        """The material with other values of some parameters.
+
+        Args:
+            values: of parameters by their name, in the units of `Material`.
+
+        Raises:
+            TypeError: if there is no parameter of such a name.
+            ValueError: if a value is out of its range.
+        """
+        refuse_unknown(values, tuple(field.name for field in fields(self)))
+        return replace(self, **values)
+
+    def scaled(self, **factors: float) -> "Material":
+        """The material with some parameters times factors.
+
+        Args:
+            factors: by a name in `FACTORS` or `FAMILIES`. `mass` multiplies the density,
+                `stiffness` the stiffness of each family.
+
+        Raises:
+            TypeError: if there is no parameter of such a name.
+            ValueError: if a product is out of the parameter's range.
+        """
+        refuse_unknown(factors, (*FACTORS, *FAMILIES))
+        values: dict[str, float] = {}
+        for name, factor in factors.items():
+            for field in GROUPS.get(name, (name,)):
+                values[field] = factor * values.get(field, getattr(self, field))
+        return replace(self, **values)
+
+
+def refuse_unknown(given: dict[str, float], known: tuple[str, ...]) -> None:
+    """Raise a `TypeError` if a name is unknown."""
+    for name in given:
+        if name not in known:
+            raise TypeError(f"{name} is no parameter here; choose from {', '.join(known)}")
+
+
+_SHEET = Material(
+    density=0.25,
+    stretch_stiffness=4.0,
+    bend_stiffness=0.5,
+    damping=1e-3,
+    drag=3.0,
+    friction=0.5,
+    thickness=0.004,
+)
+MATERIALS = MappingProxyType(
+    {
+        "rope": Material(
+            density=0.04,
+            stretch_stiffness=150.0,
+            bend_stiffness=3.0,
+            damping=0.02,
+            drag=1.0,
+            friction=0.5,
+            thickness=0.008,
+        ),
+        "cloth": Material(
+            density=0.02 / 0.09,
+            stretch_stiffness=1.5,
+            shear_stiffness=0.5,
+            bend_stiffness=0.1,
+            damping=1e-3,
+            drag=3.0,
+            friction=0.5,
+            thickness=0.004,
+        ),
+        "mesh": _SHEET,
+        "garment": _SHEET.changed(density=0.3),
+    }
+)
+"""Default materials. A garment's is two layers of a light cotton."""

@@ -1,0 +1,50 @@
+"""The console command `jaxsimp VERB ...`: finds the verb, reads its options and runs it."""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
+
+import tyro
+
+import jaxsimp
+from jaxsimp.cli.status import exit_status
+
+VERBS = ("simplify",)
+"""Modules of `jaxsimp.cli` that are verbs."""
+DESCRIPTION = """Plan how to grasp and move rope and cloth.
+
+`jaxsimp VERB --help` shows the options of a verb, `jaxsimp --version` the version."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: what follows the command's name; those of the process by default.
+
+    Returns:
+        The exit status: that of the verb, 2 for wrong input, 130 for Ctrl-C.
+    """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        print(f"jaxsimp {jaxsimp.__version__}")
+        return 0
+    options = parse(given)
+    return exit_status(options.run)
+
+
+def parse(arguments: Sequence[str]) -> Any:
+    """The options of the verb that the command line names.
+
+    Raises:
+        SystemExit: if they are wrong (status 2), or help is asked for (status 0).
+    """
+    app = tyro.extras.SubcommandApp()
+    named = bool(arguments) and arguments[0] in VERBS
+    for verb in VERBS:
+        options = import_module(f"jaxsimp.cli.{verb}").Options
+        # In the list of verbs one line stands for each.
+        told = None if named else (options.__doc__ or "").partition("\n")[0]
+        app.command(options, name=verb, help=told)
+    return app.cli(prog="jaxsimp", description=DESCRIPTION, args=arguments)

@@ -1,0 +1,99 @@
+"""What engines in JAX share: the cost of a plan, and its execution."""
+
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxsimp.dynamics import NONE, Actions, State, at_rest
+from jaxsimp.engines.engine import Execution, ExecutionStatus, SearchEngine, then_idle
+from jaxsimp.engines.population import Layout, PopulationMap
+from jaxsimp.tasks import Episode, Task, score
+
+
+def plan_cost(
+    task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
+) -> Float[Array, ""]:
+    """Cost of a plan: the sum of the running costs over its actions (paper, section IV-A).
+
+    The state that is left when the pickers have let go counts as one more step.
+    """
+
+    def running_cost(state: State, action: Actions) -> Float[Array, ""]:
+        return task.running_cost(episode, state, action)
+
+    start = at_rest(episode.start)
+    _, costs = engine.rollout(physics, start, then_idle(actions, 1), running_cost)
+    return engine.risk(costs.sum(axis=-1))
+
+
+def settled_score(
+    task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
+) -> Float[Array, ""]:
+    """Score of the state that a plan settles in."""
+    followed = then_idle(actions, task.settle_actions)
+    final, _ = engine.rollout(physics, at_rest(episode.start), followed, lambda *_: ())
+    return score(task, episode, final.position)
+
+
+class RolloutExecutor:
+    """Plans of a task, carried out by the rollouts of an engine of one physics.
+
+    Attributes:
+        compile_seconds: that compilation took, 0 before the first plan.
+    """
+
+    def __init__(self, task: Task, engine: SearchEngine, physics: PyTree[Any]) -> None:
+        """Nothing is compiled before the first plan.
+
+        Args:
+            task: what is asked.
+            engine: whose rollouts carry plans out; it observes no axis of an ensemble.
+            physics: that the rollouts are in.
+        """
+        self._task, self._engine, self._physics = task, engine, physics
+
+    @property
+    def compile_seconds(self) -> float:
+        """Seconds that compilation took."""
+        return self._compiled.compile_seconds
+
+    def __call__(self, episode: Episode, actions: Actions) -> Execution:
+        """Carry out a plan, let the body settle, and score it."""
+        one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
+        shared = (self._physics, as_float(episode))
+        (positions,), (value,), missed = self._compiled(shared, one)
+        fine = bool(np.isfinite(positions).all() and np.isfinite(value))
+        status = ExecutionStatus.FINE if fine else ExecutionStatus.UNSTABLE
+        count = None if missed is None else int(missed[0])
+        return Execution(positions, float(value), status, missed=count)
+
+    @cached_property
+    def _compiled(self) -> PopulationMap:
+        task = self._task
+        example = Episode(np.zeros_like(task.goal), np.asarray(task.goal))
+        shared, shape = (self._physics, as_float(example)), (1, task.num_actions, task.num_pickers)
+        idle = Actions(jnp.full(shape, NONE), jnp.zeros((*shape, 3), float))
+        return PopulationMap(partial(_execute, task, self._engine), shared, idle, Layout())
+
+
+def _execute(
+    task: Task, engine: SearchEngine, shared: tuple[PyTree[Any], Episode], actions: Actions
+) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""], Int[Array, ""] | None]:
+    """Positions at the start, after each action and settled, score of the last, and `missed`."""
+    physics, episode = shared
+    start = at_rest(episode.start)
+    followed = then_idle(actions, task.settle_actions)
+    final, positions = engine.rollout(physics, start, followed, lambda state, _: state.position)
+    during = positions[: task.num_actions]
+    positions = jnp.concatenate([start.position[None], during, final.position[None]])
+    return positions, score(task, episode, final.position), final.missed
+
+
+def as_float(tree: PyTree[Any]) -> PyTree[np.ndarray]:
+    """Arrays on the host, in the floating point numbers that JAX works with now."""
+    dtype = np.dtype(jnp.result_type(float))
+    return jax.tree.map(lambda array: np.asarray(array, dtype), tree)

@@ -1,0 +1,136 @@
+"""Algorithms: what a planner needs to know of a method of search. One file each.
+
+An algorithm asks for the costs of plans and is told them. It knows the space of plans and their
+costs, and nothing of bodies, tasks or physics. Two drivers run it: `optimize`, a pure loop, and
+`Planner`, a loop on the host.
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import jax
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+
+from jaxsimp.planning.archive import Archive
+from jaxsimp.planning.space import ActionSpace, Plans
+
+Wants = Literal["cost", "gradient", "settled"]
+"""What an algorithm is told of a plan: its cost; the cost and its gradient; or 1 minus the score
+of the settled state, in the physics that scores."""
+
+PRICES: dict[Wants, int] = {"cost": 1, "gradient": 6, "settled": 4}
+"""Price of a plan by what is wanted of it, in rollouts. Measured without self-contact on a CPU: a
+gradient takes 4.7 to 6 rollouts, a rollout with self-contact about 4."""
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["costs", "gradients"], meta_fields=[])
+@dataclass(frozen=True)
+class Told:
+    """What an algorithm is told of the plans that it asked for.
+
+    Attributes:
+        costs: infinite where a rollout was not finite, shape (B,).
+        gradients: of the costs by `Plans.direction`, zero where one is not finite, shape
+            (B, T, G, 3); None unless the algorithm wants them.
+    """
+
+    costs: Float[Array, " B"]
+    gradients: Float[Array, "B T G 3"] | None = None
+
+
+@runtime_checkable
+class Algorithm(Protocol):
+    """A method of search: a frozen dataclass of settings with pure functions.
+
+    States are pytrees of arrays of fixed shapes. All functions are pure JAX.
+    """
+
+    def __hash__(self) -> int:
+        """Of the settings: what is compiled for an algorithm is kept."""
+        ...
+
+    @property
+    def num_asks(self) -> int:
+        """How often it asks."""
+        ...
+
+    @property
+    def num_plans(self) -> int:
+        """Plans that it asks for at a time, `B`."""
+        ...
+
+    @property
+    def num_starts(self) -> int:
+        """Archived plans that it starts from, at most; 0 if it starts from none."""
+        ...
+
+    @property
+    def wants(self) -> Wants:
+        """What it is told of a plan."""
+        ...
+
+    def init(self, space: ActionSpace, archive: Archive) -> PyTree[Any]:
+        """The state before the first question, warmed by the archive."""
+        ...
+
+    def ask(
+        self, space: ActionSpace, state: PyTree[Any], key: PRNGKeyArray
+    ) -> tuple[PyTree[Any], Plans]:
+        """The state, and `num_plans` plans."""
+        ...
+
+    def tell(self, space: ActionSpace, state: PyTree[Any], plans: Plans, told: Told) -> PyTree[Any]:
+        """The state after the answer to the last question."""
+        ...
+
+    def answer(self, space: ActionSpace, state: PyTree[Any]) -> Plans | None:
+        """The plan to return, without a leading axis; None for the best of the archive."""
+        ...
+
+    def trace(self, state: PyTree[Any]) -> dict[str, Array]:
+        """Quantities to record after each answer, by name."""
+        ...
+
+
+class Defaults:
+    """What most algorithms answer: costs are wanted, the best plan is returned."""
+
+    num_starts: int = 0
+    wants: Wants = "cost"
+
+    def answer(self, space: ActionSpace, state: PyTree[Any]) -> Plans | None:
+        """The best of the archive."""
+        return None
+
+    def trace(self, state: PyTree[Any]) -> dict[str, Array]:
+        """Nothing."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Algorithms that follow one another: each starts from the best plans of those before.
+
+    Attributes:
+        algorithms: in their order, at least one.
+
+    Raises:
+        ValueError: if there is none.
+    """
+
+    algorithms: tuple[Algorithm, ...]
+
+    def __post_init__(self) -> None:
+        if not self.algorithms:
+            raise ValueError("algorithms is empty; give at least one algorithm")
+
+
+def stages(algorithm: Algorithm | Sequence) -> tuple[Algorithm, ...]:
+    """The algorithms of a sequence, or the one that is given."""
+    return algorithm.algorithms if isinstance(algorithm, Sequence) else (algorithm,)
+
+
+def price(algorithm: Algorithm | Sequence) -> int:
+    """Price of a search in rollouts, see `PRICES`."""
+    return sum(each.num_asks * each.num_plans * PRICES[each.wants] for each in stages(algorithm))

@@ -1,0 +1,213 @@
+"""Optimisation: algorithms run on a problem. One code for two drivers.
+
+`optimize` is a pure function, its loop a `lax.scan`: `jit` and `vmap` apply, over keys and over
+episodes. `Planner` runs the same `search`, the exchanges of each stage in a loop on the host.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from jaxsimp.dynamics import Actions
+from jaxsimp.planning.algorithm import Algorithm, Sequence, Told, Wants, stages
+from jaxsimp.planning.archive import Archive, archived, empty_archive
+from jaxsimp.planning.problem import Problem
+from jaxsimp.planning.space import ActionSpace, Plans
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["state", "archive", "failed"], meta_fields=[]
+)
+@dataclass(frozen=True)
+class Progress:
+    """How far an algorithm is.
+
+    Attributes:
+        state: of the algorithm.
+        archive: the best distinct plans so far.
+        failed: plans so far whose cost was not finite.
+    """
+
+    state: PyTree[Any]
+    archive: Archive
+    failed: Int[Array, ""]
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["actions", "cost", "archive", "best_costs", "traces", "failed"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class Optimum:
+    """What a search found.
+
+    Attributes:
+        actions: the plan, shapes (T, G) and (T, G, 3).
+        cost: of that plan; infinite if no rollout was finite.
+        archive: the best distinct plans, as algorithms see them.
+        best_costs: lowest cost so far after each question, shape (asks,).
+        traces: of each algorithm, by name: what `Algorithm.trace` gave after each question.
+        failed: plans whose cost was not finite.
+    """
+
+    actions: Actions
+    cost: Float[Array, ""]
+    archive: Archive
+    best_costs: Float[Array, " asks"]
+    traces: tuple[dict[str, Array], ...]
+    failed: Int[Array, ""]
+
+
+RunStage = Callable[
+    [Algorithm, Archive, Int[Array, ""], PRNGKeyArray], tuple[Progress, Actions, "Recorded"]
+]
+"""Runs one algorithm from an archive and a count of failures, an exchange for each key: the
+progress after the last, the actions that it returns, and a record."""
+Recorded = tuple[Float[Array, " asks"], dict[str, Array]]
+"""Lowest cost so far after each exchange, and what `Algorithm.trace` gave."""
+
+
+def optimize(
+    problem: Problem,
+    algorithm: Algorithm | Sequence,
+    key: PRNGKeyArray,
+    *,
+    batch: int | None = None,
+) -> Optimum:
+    """Search for a plan of low cost; pure, so that `jit` and `vmap` apply.
+
+    A plan whose cost is not finite ranks last and is counted.
+
+    Args:
+        problem: what is minimised.
+        algorithm: that searches, or several that follow one another.
+        key: of the random draws.
+        batch: plans evaluated at a time under one `vmap`; all that are asked for by default.
+    """
+    space = problem.space
+
+    def run_stage(
+        stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: PRNGKeyArray
+    ) -> tuple[Progress, Actions, Recorded]:
+        evaluate = evaluation(problem, stage.wants)
+
+        def exchange(progress: Progress, key: PRNGKeyArray) -> tuple[Progress, Recorded]:
+            progress, plans, actions = ask(stage, space, progress, key)
+            return absorb(stage, space, progress, plans, _mapped(evaluate, actions, batch))
+
+        first = begin(stage, space, archive, failed)
+        progress, recorded = jax.lax.scan(exchange, first, keys)
+        return progress, finish(stage, space, progress), recorded
+
+    return search(algorithm, space, key, run_stage, evaluation(problem, "cost"))
+
+
+def search(
+    algorithm: Algorithm | Sequence,
+    space: ActionSpace,
+    key: PRNGKeyArray,
+    run_stage: RunStage,
+    evaluate: Callable[[Actions], Told],
+) -> Optimum:
+    """Stage after stage: what both drivers do.
+
+    Args:
+        algorithm: that searches, or several that follow one another.
+        space: the plans that may be searched.
+        key: of the random draws.
+        run_stage: runs the exchanges of one algorithm.
+        evaluate: the cost of one plan, for an algorithm that returns another than the best.
+    """
+    archive, failed = empty_archive(space, archive_size(algorithm)), jnp.zeros((), jnp.int32)
+    records = []
+    for index, stage in enumerate(stages(algorithm)):
+        own = jax.random.fold_in(key, index) if index else key
+        keys = jax.random.split(own, stage.num_asks)
+        progress, actions, recorded = run_stage(stage, archive, failed, keys)
+        archive, failed = progress.archive, progress.failed
+        records.append(recorded)
+    cost = archive.costs[0]
+    if jax.eval_shape(stage.answer, space, progress.state) is not None:
+        cost = finite(evaluate(actions)).costs
+        failed = failed + jnp.isinf(cost)
+    best_costs = jnp.concatenate([costs for costs, _ in records])
+    return Optimum(actions, cost, archive, best_costs, tuple(trace for _, trace in records), failed)
+
+
+def archive_size(algorithm: Algorithm | Sequence) -> int:
+    """Plans that the archive must hold for the algorithms that start from it."""
+    return max(1, *(stage.num_starts for stage in stages(algorithm)))
+
+
+def begin(
+    algorithm: Algorithm, space: ActionSpace, archive: Archive, failed: Int[Array, ""]
+) -> Progress:
+    """Before the first question."""
+    return Progress(algorithm.init(space, archive), archive, failed)
+
+
+def ask(
+    algorithm: Algorithm, space: ActionSpace, progress: Progress, key: PRNGKeyArray
+) -> tuple[Progress, Plans, Actions]:
+    """A question: plans to evaluate, and their actions."""
+    state, plans = algorithm.ask(space, progress.state, key)
+    return Progress(state, progress.archive, progress.failed), plans, space.actions(plans)
+
+
+def absorb(
+    algorithm: Algorithm, space: ActionSpace, progress: Progress, plans: Plans, told: Told
+) -> tuple[Progress, Recorded]:
+    """The answer to a question, and what is recorded of it."""
+    failed = progress.failed + jnp.sum(~jnp.isfinite(told.costs), dtype=jnp.int32)
+    told = finite(told)
+    if told.gradients is not None:  # by displacements: now by what they are in units of the limits
+        limits = jnp.broadcast_to(space.limits, told.gradients.shape)
+        told = Told(told.costs, told.gradients * limits)
+    state = algorithm.tell(space, progress.state, plans, told)
+    archive = progress.archive
+    if algorithm.wants != "settled":  # those are no costs
+        archive = archived(archive, space, plans, told.costs)
+    return Progress(state, archive, failed), (archive.costs[0], algorithm.trace(state))
+
+
+def finish(algorithm: Algorithm, space: ActionSpace, progress: Progress) -> Actions:
+    """The plan that an algorithm returns: its answer, or the best of the archive."""
+    plan = algorithm.answer(space, progress.state)
+    if plan is None:
+        plan = jax.tree.map(lambda leaf: leaf[0], progress.archive.plans)
+    return space.actions(plan)
+
+
+def finite(told: Told) -> Told:
+    """Costs with infinity, and gradients with zero, for those that are not finite."""
+    gradients = told.gradients
+    if gradients is not None:
+        fine = jnp.isfinite(gradients).all(axis=(-3, -2, -1), keepdims=True)
+        gradients = jnp.where(fine, gradients, 0.0)
+    return Told(jnp.where(jnp.isfinite(told.costs), told.costs, jnp.inf), gradients)
+
+
+def evaluation(problem: Problem, wants: Wants) -> Callable[[Actions], Told]:
+    """What is wanted of one plan; gradients are by its displacements."""
+    if wants == "cost":
+        return lambda actions: Told(problem.cost(actions))
+    if wants == "settled":
+        return lambda actions: Told(problem.settled_cost(actions))
+
+    def cost(displacement: Float[Array, "T G 3"], pick: Int[Array, "T G"]) -> Float[Array, ""]:
+        return problem.cost(Actions(pick, displacement))
+
+    return lambda actions: Told(*jax.value_and_grad(cost)(actions.displacement, actions.pick))
+
+
+def _mapped(evaluate: Callable[[Actions], Told], plans: Actions, batch: int | None) -> Told:
+    """The evaluation of plans along a first axis."""
+    if batch is None:
+        return jax.vmap(evaluate)(plans)
+    return jax.lax.map(evaluate, plans, batch_size=batch)

@@ -1,0 +1,254 @@
+"""Planner: algorithms run on the host, on all cores, with progress; and plans carried out."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsimp.dynamics import NONE, Actions
+from jaxsimp.engines import (
+    Engine,
+    Execution,
+    Executor,
+    Layout,
+    MassSprings,
+    PopulationMap,
+    SearchEngine,
+    default_layout,
+)
+from jaxsimp.engines.rollouts import as_float
+from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence, Told, Wants, stages
+from jaxsimp.planning.cem import CEM
+from jaxsimp.planning.host import compiled_exchanges, search_on_host
+from jaxsimp.planning.loop import Optimum, archive_size, evaluation
+from jaxsimp.planning.problem import Candidates, TaskProblem, action_space, make_problem
+from jaxsimp.planning.space import ActionSpace
+from jaxsimp.tasks import Episode, Task
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A plan and how it was found.
+
+    Attributes:
+        actions: shapes (T, G) and (T, G, 3).
+        optimum: costs by question, the best distinct plans, and failures, on the host.
+        num_rollouts: plans evaluated.
+        price: of the search, in rollouts: a gradient is more than one, see `PRICES`.
+        seconds: that the search took, compilation not included.
+        compile_seconds: that compilation took, next to nothing where an earlier plan has had as
+            many candidates and the same algorithm.
+    """
+
+    actions: Actions
+    optimum: Optimum
+    num_rollouts: int
+    price: int
+    seconds: float
+    compile_seconds: float
+
+
+class Planner:
+    """A task made ready to be planned for: what is compiled is kept for further plans.
+
+    Attributes:
+        task: what is planned for.
+        engine: that plans are costed in.
+        evaluator: engine that carries out plans, and scores them.
+        layout: of populations on this machine; None for the one measured to be best.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        engine: SearchEngine | None = None,
+        evaluator: Engine | None = None,
+        layout: Layout | None = None,
+    ) -> None:
+        """Nothing is compiled before it is needed.
+
+        Args:
+            task: what is planned for.
+            engine: that plans are costed in; by default our own dynamics, the body passing through
+                itself.
+            evaluator: engine that carries out plans; by default our own dynamics, the body
+                touching itself.
+            layout: of populations on this machine; by default the one measured to be best.
+
+        Raises:
+            ValueError: if the engine refuses the task.
+        """
+        self.task, self.layout = task, layout
+        self.engine = engine or MassSprings()
+        self.evaluator = evaluator or MassSprings(self_contact=True)
+        self._maps: dict[tuple[Wants, int], tuple[TaskProblem, PopulationMap]] = {}
+        # Evaluations do not look at candidates: any will do.
+        self._problem = self._host_problem(None)
+
+    def plan(
+        self,
+        episode: Episode,
+        candidates: Candidates,
+        algorithm: Algorithm | Sequence | None = None,
+        seed: int = 0,
+        on_ask: Callable[[], None] = lambda: None,
+    ) -> Plan:
+        """Search for a plan.
+
+        Args:
+            episode: start and goal.
+            candidates: particles that may be grasped: key points, ids, or a mask.
+            algorithm: that searches, or several that follow one another; `CEM()` by default.
+            seed: of the random draws.
+            on_ask: called after each question of the algorithm.
+
+        Raises:
+            ValueError: if a candidate is no particle of the body, or the algorithm asks for
+                settled scores and the evaluator is no engine in JAX.
+        """
+        algorithm = algorithm or CEM()
+        space = action_space(self.task, candidates)
+        compile_seconds = self.prepare(algorithm, space)
+        bill = _Bill(partial(self._told, as_float(episode)))
+        start = time.perf_counter()
+        optimum = search_on_host(algorithm, space, jax.random.key(seed), bill, on_ask)
+        optimum = jax.device_get(optimum)
+        return Plan(
+            actions=jax.tree.map(jnp.asarray, optimum.actions),
+            optimum=optimum,
+            num_rollouts=bill.num_plans,
+            price=bill.price,
+            seconds=time.perf_counter() - start,
+            compile_seconds=compile_seconds,
+        )
+
+    def prepare(self, algorithm: Algorithm | Sequence, space: ActionSpace | None = None) -> float:
+        """Compile what an algorithm needs, and return the seconds that it took.
+
+        Args:
+            algorithm: that will search, or several that will follow one another.
+            space: the plans that will be searched; without it evaluations alone are compiled.
+
+        Raises:
+            ValueError: if the algorithm asks for settled scores and the evaluator is no engine in
+                JAX.
+        """
+        start = time.perf_counter()
+        for stage in stages(algorithm):
+            self._map(stage.wants, stage.num_plans)
+            if space is not None:
+                compiled_exchanges(stage, space, archive_size(algorithm))
+        return time.perf_counter() - start
+
+    def costs(self, episode: Episode, actions: Actions) -> Float[np.ndarray, " B"]:
+        """Costs of plans: what a search minimises.
+
+        Args:
+            episode: start and goal.
+            actions: the plans, shapes (B, T, G) and (B, T, G, 3).
+        """
+        return np.asarray(self._told(as_float(episode), "cost", actions).costs)
+
+    def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
+        """Seconds that a plan takes, from one evaluation of plans that grasp and move anything.
+
+        With self-contact the folds that a search comes to take up to twice as long as those.
+        """
+        episode, seconds = as_float(self.task.episode_fn(0)), 0.0
+        for stage in stages(algorithm):
+            drawn = self._random_plans(stage.num_plans)
+            self.prepare(stage)
+            start = time.perf_counter()
+            self._told(episode, stage.wants, drawn)
+            seconds += (time.perf_counter() - start) * stage.num_asks
+        return seconds
+
+    def execute(self, episode: Episode, actions: Actions) -> Execution:
+        """Carry out a plan in the evaluator's physics, let the body settle, and score it."""
+        return self._executor(episode, actions)
+
+    @cached_property
+    def _executor(self) -> Executor:
+        return self.evaluator.executor(self.task)
+
+    def _random_plans(self, size: int) -> Actions:
+        """Plans that grasp and move anything."""
+        task, rng = self.task, np.random.default_rng(0)
+        shape = (size, task.num_actions, task.num_pickers)
+        picks = rng.integers(task.body.num_particles, size=shape)
+        moves = rng.uniform(-1, 1, (*shape, 3)) * task.limits
+        return Actions(jnp.asarray(picks), jnp.asarray(moves, float))
+
+    def _told(self, episode: Episode, wants: Wants, actions: Actions) -> Told:
+        """What is wanted of plans, evaluated on all cores."""
+        problem, evaluate = self._map(wants, len(actions.pick))
+        return evaluate(dataclasses.replace(problem, episode=episode), actions)
+
+    def _map(self, wants: Wants, size: int) -> tuple[TaskProblem, PopulationMap]:
+        """A problem, and its evaluation compiled for `size` plans or more."""
+        fitting = [key for key in self._maps if key[0] == wants and key[1] >= size]
+        key = min(fitting, default=(wants, size))
+        if key not in self._maps:
+            problem = self._settled_problem if wants == "settled" else self._problem
+            self._maps[key] = problem, self._compiled(problem, wants, size)
+        return self._maps[key]
+
+    def _compiled(self, problem: TaskProblem, wants: Wants, size: int) -> PopulationMap:
+        shape = (size, self.task.num_actions, self.task.num_pickers)
+        idle = Actions(jnp.full(shape, NONE), jnp.zeros((*shape, 3), float))
+        layout = self._layout(problem, wants, size)
+        return PopulationMap(partial(_evaluate, wants), problem, idle, layout)
+
+    def layout_of(self, algorithm: Algorithm) -> Layout:
+        """How the plans of an algorithm's question are laid on this machine."""
+        problem, _ = self._map(algorithm.wants, algorithm.num_plans)
+        return self._layout(problem, algorithm.wants, algorithm.num_plans)
+
+    def _layout(self, problem: TaskProblem, wants: Wants, size: int) -> Layout:
+        return self.layout or default_layout(size, problem.chunk_size(wants))
+
+    @cached_property
+    def _settled_problem(self) -> TaskProblem:
+        if not isinstance(self.evaluator, SearchEngine):
+            raise ValueError(
+                f"the algorithm asks for settled scores and the evaluator is {self.evaluator}, no "
+                f"engine in JAX; give another evaluator, as MassSprings(self_contact=True)"
+            )
+        return self._host_problem(self.evaluator)
+
+    def _host_problem(self, evaluator: SearchEngine | None) -> TaskProblem:
+        """The problem of the goal from the goal, with some candidate, and arrays on the host."""
+        goal = np.asarray(self.task.goal)
+        found = make_problem(
+            self.task, np.zeros(1, int), Episode(goal, goal), self.engine, evaluator
+        )
+        return dataclasses.replace(found, episode=as_float(found.episode))
+
+
+def _evaluate(wants: Wants, problem: TaskProblem, actions: Actions) -> Told:
+    return evaluation(problem, wants)(actions)
+
+
+class _Bill:
+    """Evaluations of plans, counted.
+
+    Attributes:
+        num_plans: evaluated so far.
+        price: of them, in rollouts.
+    """
+
+    def __init__(self, evaluate: Callable[[Wants, Actions], Told]) -> None:
+        self._evaluate = evaluate
+        self.num_plans = self.price = 0
+
+    def __call__(self, wants: Wants, actions: Actions) -> Told:
+        """What is wanted of plans."""
+        self.num_plans += len(actions.pick)
+        self.price += PRICES[wants] * len(actions.pick)
+        return self._evaluate(wants, actions)

@@ -1,0 +1,141 @@
+"""Problems: what an algorithm minimises: plans of a task, costed in an engine, in an episode."""
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxsimp.dynamics import Actions
+from jaxsimp.engines import MassSprings, SearchEngine, plan_cost, settled_score
+from jaxsimp.planning.algorithm import Wants
+from jaxsimp.planning.space import ActionSpace, as_candidates
+from jaxsimp.simplification import KeyPoints
+from jaxsimp.tasks import Episode, Task
+
+Candidates = KeyPoints | Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]
+"""Particles that may be grasped: key points, ids, or a mask of the body's particles."""
+
+
+@runtime_checkable
+class Problem(Protocol):
+    """What `optimize` needs to know of a problem: a pytree with these functions of plans."""
+
+    @property
+    def space(self) -> ActionSpace:
+        """The plans that may be searched."""
+        ...
+
+    def cost(self, actions: Actions) -> Float[Array, ""]:
+        """Cost of a plan; pure JAX, differentiable where an algorithm wants gradients."""
+        ...
+
+    def settled_cost(self, actions: Actions) -> Float[Array, ""]:
+        """Cost of the state that a plan settles in; only called where an algorithm wants it."""
+        ...
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["space", "episode", "physics", "settled_physics"],
+    meta_fields=["task", "engine", "evaluator"],
+)
+@dataclass(frozen=True, eq=False)
+class TaskProblem:
+    """A task, an episode and candidates, in the physics of an engine.
+
+    A pytree: `jax.vmap` applies over episodes, as `dataclasses.replace(problem, episode=...)`.
+
+    Attributes:
+        space: the plans that may be searched.
+        episode: start and goal.
+        physics: of the engine, that plans are costed in.
+        settled_physics: of the evaluator.
+        task: what is asked; static.
+        engine: that plans are costed in; static.
+        evaluator: engine that scores settled states, for algorithms that ask for them; static.
+    """
+
+    space: ActionSpace
+    episode: Episode
+    physics: PyTree[Any]
+    settled_physics: PyTree[Any]
+    task: Task
+    engine: SearchEngine
+    evaluator: SearchEngine | None
+
+    def cost(self, actions: Actions) -> Float[Array, ""]:
+        """Cost of a plan: the sum of the running costs, see `plan_cost`."""
+        return plan_cost(self.task, self.engine, self.physics, self.episode, actions)
+
+    def settled_cost(self, actions: Actions) -> Float[Array, ""]:
+        """1 minus the score of the settled state, in the physics of the evaluator.
+
+        Raises:
+            ValueError: if the problem has no evaluator.
+        """
+        if self.evaluator is None:
+            raise ValueError(
+                "the algorithm asks for settled scores and the problem has no evaluator; give "
+                "`make_problem` one, as MassSprings(self_contact=True)"
+            )
+        return 1.0 - settled_score(
+            self.task, self.evaluator, self.settled_physics, self.episode, actions
+        )
+
+    def chunk_size(self, wants: Wants) -> int:
+        """Plans that are evaluated fastest under one `vmap` on a core of a CPU."""
+        if wants == "settled" and self.evaluator is not None:
+            return self.evaluator.chunk_size(self.settled_physics)
+        return self.engine.chunk_size(self.physics)
+
+
+def make_problem(
+    task: Task,
+    candidates: Candidates,
+    episode: Episode | None = None,
+    engine: SearchEngine | None = None,
+    evaluator: SearchEngine | None = None,
+) -> TaskProblem:
+    """The problem of a task.
+
+    Args:
+        task: what is asked.
+        candidates: particles that may be grasped.
+        episode: start and goal; those of seed 0 by default.
+        engine: that plans are costed in; by default our own dynamics, the body passing through
+            itself.
+        evaluator: engine that scores settled states; needed by algorithms that ask for them.
+
+    Raises:
+        ValueError: if a candidate is no particle of the body, or an engine refuses the task.
+    """
+    engine = engine or MassSprings()
+    episode = episode or task.episode_fn(0)
+    return TaskProblem(
+        space=action_space(task, candidates),
+        episode=jax.tree.map(partial(jnp.asarray, dtype=float), episode),
+        physics=engine.physics(task),
+        settled_physics=evaluator.physics(task) if evaluator else (),
+        task=task,
+        engine=engine,
+        evaluator=evaluator,
+    )
+
+
+def action_space(task: Task, candidates: Candidates) -> ActionSpace:
+    """The plans of a task over candidates.
+
+    Raises:
+        ValueError: if a candidate is no particle of the body.
+    """
+    given = candidates.particles if isinstance(candidates, KeyPoints) else candidates
+    return ActionSpace(
+        jnp.asarray(as_candidates(given, task.body.num_particles)),
+        jnp.asarray(task.limits, dtype=float),
+        task.num_actions,
+        task.num_pickers,
+    )

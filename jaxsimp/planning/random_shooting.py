@@ -1,0 +1,49 @@
+"""Random shooting: draw plans evenly, keep the best. The least that a search can be."""
+
+from dataclasses import dataclass
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from jaxsimp.planning.algorithm import Defaults, Told
+from jaxsimp.planning.archive import Archive
+from jaxsimp.planning.space import ActionSpace, Plans
+
+
+@dataclass(frozen=True)
+class RandomShooting(Defaults):
+    """Plans with choices and displacements drawn evenly.
+
+    Attributes:
+        num_asks: populations drawn.
+        num_plans: plans of a population.
+
+    Raises:
+        ValueError: if a number is below 1.
+    """
+
+    num_asks: int = 27
+    num_plans: int = 128
+
+    def __post_init__(self) -> None:
+        for name in ("num_asks", "num_plans"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
+
+    def init(self, space: ActionSpace, archive: Archive) -> tuple[()]:
+        """Nothing is remembered."""
+        return ()
+
+    def ask(
+        self, space: ActionSpace, state: tuple[()], key: PRNGKeyArray
+    ) -> tuple[tuple[()], Plans]:
+        """Draw a population."""
+        key_choice, key_move = jax.random.split(key)
+        shape = (self.num_plans, space.num_actions, space.num_pickers)
+        choice = jax.random.randint(key_choice, shape, 0, len(space.candidates) + 1)
+        move = jax.random.uniform(key_move, (*shape, 3), float, minval=-1.0, maxval=1.0)
+        return state, Plans(choice, move)
+
+    def tell(self, space: ActionSpace, state: tuple[()], plans: Plans, told: Told) -> tuple[()]:
+        """The archive keeps the best."""
+        return state

@@ -1,0 +1,86 @@
+"""The plans that may be searched: candidates, limits, and plans in units of them."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsimp.dynamics import NONE, Actions
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["choice", "direction"], meta_fields=[])
+@dataclass(frozen=True)
+class Plans:
+    """Plans as algorithms see them: numbers of candidates, and displacements without unit.
+
+    Attributes:
+        choice: index of the grasped candidate, K for none, shape (*B, T, G).
+        direction: displacement in units of the limits, in [-1, 1], shape (*B, T, G, 3).
+    """
+
+    choice: Int[Array, "*B T G"]
+    direction: Float[Array, "*B T G 3"]
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["candidates", "limits"],
+    meta_fields=["num_actions", "num_pickers"],
+)
+@dataclass(frozen=True)
+class ActionSpace:
+    """The plans that may be searched.
+
+    Attributes:
+        candidates: ids of the particles that may be grasped, shape (K,).
+        limits: largest displacement of one action along x, y, z, shape (3,), metres.
+        num_actions: `T`, static.
+        num_pickers: `G`, static.
+    """
+
+    candidates: Int[Array, " K"]
+    limits: Float[Array, " 3"]
+    num_actions: int
+    num_pickers: int
+
+    def actions(self, plans: Plans) -> Actions:
+        """The actions of plans."""
+        ids = jnp.append(self.candidates, NONE)
+        limits = jnp.broadcast_to(self.limits, plans.direction.shape)
+        return Actions(ids[plans.choice], plans.direction * limits)
+
+
+def as_candidates(
+    candidates: Int[np.ndarray, " K"] | Bool[np.ndarray, " N"], num_particles: int
+) -> Int[np.ndarray, " K"]:
+    """Ids of the particles that may be grasped, from ids or from a mask of particles.
+
+    Args:
+        candidates: ids, shape (K,), or a mask that is True at the candidates, shape (N,).
+        num_particles: of the body, `N`.
+
+    Raises:
+        ValueError: if there is no candidate, an id is no particle of the body or is given twice,
+            or the array has another shape or type.
+    """
+    given = np.asarray(candidates)
+    if given.dtype == bool and given.shape == (num_particles,):
+        given = np.flatnonzero(given)
+    if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(
+            f"candidates is an array of {given.dtype} of shape {given.shape}; give the ids of "
+            f"particles, shape (K,), or a mask of shape ({num_particles},)"
+        )
+    wrong = given[(given < 0) | (given >= num_particles)]
+    if wrong.size or not given.size:
+        named = f"names particle {wrong[0]}" if wrong.size else "is empty"
+        raise ValueError(
+            f"candidates {named}; give at least one of the ids 0 to {num_particles - 1} of a body "
+            f"of {num_particles} particles"
+        )
+    if len(np.unique(given)) < len(given):
+        raise ValueError("candidates names a particle twice; give each id once")
+    return given

@@ -1,0 +1,197 @@
+"""Plan files: a plan that can be viewed, replayed and exported without the study that made it.
+
+A file is an `.npz` of plain arrays: the actions, the motion, start and goal, the body's arrays
+under `body/`, and one text, `about`, of JSON: task, engine, score, and what the results depend on.
+Files of actions and motion alone, as version 0.1 wrote them, are read, too.
+"""
+
+import dataclasses
+import io
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxsimp.bodies import Body, Material
+from jaxsimp.dynamics import Actions
+from jaxsimp.engines import Execution
+from jaxsimp.records.provenance import environment
+from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, task_names
+
+SETTINGS = ("limits", "num_actions", "num_pickers", "action_seconds", "settle_actions")
+"""Numbers of a task that a file keeps."""
+
+
+@dataclass(frozen=True, eq=False)
+class SavedPlan:
+    """A plan that was read from a file.
+
+    Attributes:
+        actions: shapes (T, G) and (T, G, 3).
+        positions: of its execution, at the start, after each action, and settled, shape
+            (T + 2, N, 3), metres.
+        body: what is manipulated; None in a file of version 0.1.
+        episode: start and goal; None in a file of version 0.1.
+        about: task, engine, score, status, missed contacts, environment, and what the writer added
+            under `found`; empty in a file of version 0.1.
+    """
+
+    actions: Actions
+    positions: Float[np.ndarray, "T2 N 3"]
+    body: Body | None = None
+    episode: Episode | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def task(self) -> Task:
+        """The task of the plan, with its body, start and goal, to replay or score it.
+
+        A registered task has its own costs; any other is given the mean distance to the goal, as
+        a file holds no functions.
+
+        Raises:
+            ValueError: if the file is of version 0.1, which keeps no task.
+        """
+        if self.body is None or self.episode is None:
+            raise ValueError(
+                "the plan file is of version 0.1, which keeps no task; make the task that it was "
+                "planned for by `make_task`"
+            )
+        told = self.about["task"]
+        settings = {name: told[name] for name in SETTINGS} | {
+            "limits": tuple(told["limits"]),
+            "longest_time_step": told["time_step"],
+            "episode_fn": FixedStart(self.episode),
+        }
+        if told["name"] in task_names():
+            registered = make_task(told["name"], told["resolution"])
+            return dataclasses.replace(registered, body=self.body, **settings)
+        return Task(
+            body=self.body,
+            goal=np.asarray(self.episode.goal),
+            running_cost=distance_cost,
+            terminal_cost=distance_cost,
+            name=told["name"],
+            **settings,
+        )
+
+
+def save_plan(
+    path: str | Path,
+    task: Task,
+    episode: Episode,
+    actions: Actions,
+    execution: Execution,
+    *,
+    engine: object,
+    found: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a plan as `.npz`: it appears under its name whole or not at all.
+
+    Args:
+        path: of the file.
+        task: what was asked.
+        episode: start and goal.
+        actions: the plan.
+        execution: what the plan does.
+        engine: that executed it; its text is kept.
+        found: what else is worth keeping, as JSON: how the plan was found.
+        provenance: what the results depend on, by default `environment()`.
+    """
+    about = {
+        "task": _task_text(task),
+        "engine": str(engine),
+        "score": execution.score if np.isfinite(execution.score) else None,
+        "status": execution.status.name,
+        "missed": execution.missed,
+        "body": _body_text(task.body),
+        "environment": dict(provenance or environment()),
+        "found": dict(found or {}),
+    }
+    arrays = {
+        "pick": actions.pick,
+        "displacement": actions.displacement,
+        "positions": execution.positions,
+        "start": episode.start,
+        "goal": episode.goal,
+        "about": json.dumps(about),
+    }
+    _write_whole(Path(path), arrays | _body_arrays(task.body))
+
+
+def load_plan(path: str | Path) -> SavedPlan:
+    """Read a plan written by `save_plan`.
+
+    Raises:
+        ValueError: if the file holds no plan.
+    """
+    arrays = _read(Path(path))
+    missing = {"pick", "displacement", "positions"} - arrays.keys()
+    if missing:
+        raise ValueError(f"{path} has no {', '.join(sorted(missing))}; it is not a saved plan")
+    actions = Actions(jnp.asarray(arrays["pick"]), jnp.asarray(arrays["displacement"]))
+    if "about" not in arrays:
+        return SavedPlan(actions, arrays["positions"])
+    try:
+        about = json.loads(str(arrays["about"]))
+        body = _body(about["body"], arrays)
+        episode = Episode(arrays["start"], arrays["goal"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({type(error).__name__}: {error})") from error
+    return SavedPlan(actions, arrays["positions"], body, episode, about)
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open("rb") as file:
+            return dict(np.load(file))
+    except (ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} cannot be read ({error}); it is not a saved plan") from error
+
+
+def _write_whole(path: Path, arrays: Mapping[str, Any]) -> None:
+    written = io.BytesIO()
+    np.savez_compressed(written, **arrays)
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(written.getvalue())
+    os.replace(part, path)
+
+
+def _task_text(task: Task) -> dict[str, Any]:
+    return {
+        "name": task.name,
+        "resolution": task.resolution,
+        **{name: getattr(task, name) for name in SETTINGS},
+        "time_step": task.time_step,
+    }
+
+
+def _is_array(field: dataclasses.Field[Any], body: Body) -> bool:
+    return isinstance(getattr(body, field.name), np.ndarray)
+
+
+def _body_arrays(body: Body) -> dict[str, np.ndarray]:
+    names = [field.name for field in dataclasses.fields(body) if _is_array(field, body)]
+    return {f"body/{name}": getattr(body, name) for name in names}
+
+
+def _body_text(body: Body) -> dict[str, Any]:
+    """Everything of a body but its arrays."""
+    names = [field.name for field in dataclasses.fields(body) if not _is_array(field, body)]
+    values = {name: getattr(body, name) for name in names}
+    return values | {"material": dataclasses.asdict(body.material)}
+
+
+def _body(told: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Body:
+    own = {name: array for name, array in arrays.items() if name.startswith("body/")}
+    values: dict[str, Any] = {name.removeprefix("body/"): array for name, array in own.items()}
+    material, shape = Material(**told["material"]), tuple(told["shape"])
+    return Body(**{**told, **values, "material": material, "shape": shape})

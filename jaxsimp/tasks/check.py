@@ -1,0 +1,145 @@
+"""What a task refuses when it is made: numbers out of range, functions that JAX cannot compile."""
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from numbers import Integral, Real
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from jaxsimp.dynamics import NONE, Actions, State, at_rest
+from jaxsimp.tasks.episode import DrawFn, Episode, RunningCost, TerminalCost
+
+
+def check_count(name: str, value: object, least: int) -> None:
+    """Refuse what is no whole number, or one below `least`.
+
+    Raises:
+        ValueError: if it is.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name} is {value}; give a whole number of at least {least}")
+
+
+def check_seconds(name: str, value: object) -> None:
+    """Refuse what is no positive, finite number.
+
+    Raises:
+        ValueError: if it is.
+    """
+    if not _is_positive(value):
+        raise ValueError(f"{name} is {value}; give a positive, finite number of seconds")
+
+
+def check_limits(limits: object) -> None:
+    """Refuse what are not three positive, finite numbers.
+
+    Raises:
+        ValueError: if they are not.
+    """
+    if not isinstance(limits, tuple) or len(limits) != 3 or not all(map(_is_positive, limits)):
+        raise ValueError(
+            f"limits is {limits}; give a tuple of three positive, finite displacements in metres, "
+            f"along x, y and z"
+        )
+
+
+def check_costs(
+    running_cost: RunningCost, terminal_cost: TerminalCost, num_particles: int, num_pickers: int
+) -> None:
+    """Refuse costs that JAX cannot compile, or that are no float scalars.
+
+    The costs are traced with arrays that have a shape and no values; nothing is computed.
+
+    Args:
+        running_cost: of an episode, a state and an action.
+        terminal_cost: of an episode and a state.
+        num_particles: number of particles of the body, `N`.
+        num_pickers: number of pickers, `G`.
+
+    Raises:
+        ValueError: if a cost takes other arguments, fails, or returns anything but one float.
+    """
+    examples = partial(_examples, num_particles, num_pickers)
+    _check_cost("running_cost", running_cost, examples, ("episode", "state", "action"))
+    _check_cost("terminal_cost", terminal_cost, examples, ("episode", "state"))
+
+
+def check_draw(draw_fn: DrawFn, num_particles: int) -> None:
+    """Refuse what draws no episode of `num_particles` by a key, in pure JAX.
+
+    Raises:
+        ValueError: if it fails, or returns anything else.
+    """
+
+    def draw() -> list[Array | np.ndarray]:
+        found = draw_fn(jax.random.key(0))
+        return [found.start, found.goal] if isinstance(found, Episode) else []
+
+    found = _trace("draw_fn", draw, "it must accept a key, as made by jax.random.key")
+    shapes = [array.shape for array in found]
+    if shapes != [(num_particles, 3)] * 2:
+        raise ValueError(
+            f"draw_fn returns {f'arrays of shapes {shapes}' if shapes else 'no Episode'}; return "
+            f"an Episode of start and goal, shape ({num_particles}, 3) each"
+        )
+
+
+def _examples(num_particles: int, num_pickers: int) -> tuple[Episode, State, Actions]:
+    positions = jnp.zeros((num_particles, 3))
+    action = Actions(jnp.full(num_pickers, NONE), jnp.zeros((num_pickers, 3)))
+    return Episode(positions, positions), at_rest(positions), action
+
+
+def _check_cost(
+    name: str, cost: Callable[..., Any], examples: Callable[[], Any], arguments: tuple[str, ...]
+) -> None:
+    """Refuse one cost.
+
+    Args:
+        name: of the cost.
+        cost: what is checked.
+        examples: makes an episode, a state and an action, under a trace.
+        arguments: names of those of the examples that the cost is called with.
+    """
+    try:
+        inspect.signature(cost).bind(*arguments)
+    except TypeError as error:
+        raise ValueError(
+            f"{name} is called as {name}({', '.join(arguments)}), which fails: {error}; give a "
+            f"function of these arguments"
+        ) from error
+    remedy = "it must accept positions of shape (N, 3), and an action of shapes (G,) and (G, 3)"
+    found = _trace(name, lambda: cost(*examples()[: len(arguments)]), remedy)
+    if not isinstance(found, jax.ShapeDtypeStruct):
+        raise ValueError(f"{name} returns a {type(found).__name__}; return one float, as a scalar")
+    if found.shape != ():
+        raise ValueError(
+            f"{name} returns an array of shape {found.shape}; return a scalar, such as its mean()"
+        )
+    if not jnp.issubdtype(found.dtype, jnp.floating):
+        raise ValueError(f"{name} returns a scalar of type {found.dtype}; return a float")
+
+
+def _trace(name: str, call: Callable[[], Any], remedy: str) -> PyTree[Any]:
+    """Shapes and types of what a call returns; a failure of it is refused with the remedy."""
+    try:
+        return jax.eval_shape(call)
+    except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:
+        raise ValueError(
+            f"{name} asks for the values of arrays, and JAX compiles it before there are any "
+            f"({type(error).__name__}); write it with jax.numpy instead of NumPy, and with "
+            f"jnp.where instead of if"
+        ) from error
+    except Exception as error:
+        said = (str(error).splitlines() or [""])[0]
+        raise ValueError(f"{name} fails with {type(error).__name__}: {said}; {remedy}") from error
+
+
+def _is_positive(value: object) -> bool:
+    """Whether a value is a positive, finite number."""
+    return isinstance(value, Real) and 0 < float(value) < float("inf")

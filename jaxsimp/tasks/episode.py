@@ -1,0 +1,35 @@
+"""An episode, and the functions of one that a task is made of."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxsimp.dynamics import Actions, State
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
+@dataclass(frozen=True)
+class Episode:
+    """Where one run starts and where it should end.
+
+    Attributes:
+        start: positions, shape (N, 3), metres; a batch has axes before.
+        goal: positions, of the same shape, metres.
+    """
+
+    start: Float[Array | np.ndarray, "... N 3"]
+    goal: Float[Array | np.ndarray, "... N 3"]
+
+
+EpisodeFn = Callable[[int], Episode]
+"""The episode of a seed."""
+DrawFn = Callable[[PRNGKeyArray], Episode]
+"""A random episode, drawn by a key; pure JAX."""
+RunningCost = Callable[[Episode, State, Actions], Float[Array, ""]]
+"""Cost of the state at the end of an action, and of that action, shapes (G,) and (G, 3)."""
+TerminalCost = Callable[[Episode, State], Float[Array, ""]]
+"""Cost of the settled state."""

@@ -1,0 +1,96 @@
+"""The registry of tasks: factories that take the resolution, by name."""
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from numbers import Integral
+
+from jaxsimp.tasks.task import Task
+
+LEAST_RESOLUTION = 5
+"""Smallest number of particles along a side."""
+
+TaskFactory = Callable[[int], Task]
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """What `register` was told of a task."""
+
+    factory: TaskFactory
+    full: int
+    quick: int
+    group: str
+
+
+_REGISTRY: dict[str, _Entry] = {}
+
+
+def register(
+    *, full: int, quick: int, group: str = "others"
+) -> Callable[[TaskFactory], TaskFactory]:
+    """Add a task to the registry, under the name of the function that makes it.
+
+    The function then gives its tasks this name and the resolution that they are made with.
+
+    Args:
+        full: resolution of the task as it is studied.
+        quick: resolution for tests and smoke runs.
+        group: of tasks that are studied together: "paper" or "goals" here.
+
+    Raises:
+        ValueError: if the name is taken.
+    """
+
+    def add(factory: TaskFactory) -> TaskFactory:
+        name = factory.__name__
+        if name in _REGISTRY:
+            raise ValueError(f"task {name!r} is registered already; choose another name")
+
+        @wraps(factory)
+        def named(resolution: int) -> Task:
+            return _named(factory(resolution), name, resolution)
+
+        _REGISTRY[name] = _Entry(named, full, quick, group)
+        return named
+
+    return add
+
+
+def _named(task: Task, name: str, resolution: int) -> Task:
+    """The task with a name and a resolution; what was checked is not checked again."""
+    named = copy.copy(task)
+    object.__setattr__(named, "name", name)
+    object.__setattr__(named, "resolution", resolution)
+    return named
+
+
+def task_names(group: str | None = None) -> tuple[str, ...]:
+    """Names of the registered tasks of a group, or of all."""
+    return tuple(name for name, entry in _REGISTRY.items() if group in (None, entry.group))
+
+
+def make_task(name: str, resolution: int | None = None, *, quick: bool = False) -> Task:
+    """A registered task.
+
+    Args:
+        name: one of `task_names()`.
+        resolution: particles along the rope or along a side of the cloth; a garment has its
+            square of them. By default that of the full or the quick scale.
+        quick: which of the two scales is the default.
+
+    Raises:
+        ValueError: if there is no such task, or the resolution is no whole number or too low.
+    """
+    if name not in _REGISTRY:
+        raise ValueError(f"unknown task {name!r}; choose from {', '.join(_REGISTRY)}")
+    entry = _REGISTRY[name]
+    if resolution is None:
+        resolution = entry.quick if quick else entry.full
+    if not isinstance(resolution, Integral) or resolution < LEAST_RESOLUTION:
+        raise ValueError(
+            f"resolution is {resolution}; a task needs a whole number of particles a side, at "
+            f"least {LEAST_RESOLUTION}"
+        )
+    return entry.factory(int(resolution))

@@ -1,0 +1,91 @@
+"""Starts and goals of episodes: always the same, turned at random, or crumpled.
+
+Called with a seed they make an episode in NumPy. Those that need no simulation also `draw` one by
+a key, in pure JAX.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from jaxsimp import goals
+from jaxsimp.bodies import Body
+from jaxsimp.tasks.crumpling import crumple
+from jaxsimp.tasks.episode import Episode
+
+LARGEST_ANGLE = np.pi / 4
+"""Largest angle, radians, by which `TurnedStart` turns a body either way, as in SoftGym."""
+
+
+@dataclass(frozen=True, eq=False)
+class FixedStart:
+    """The same episode for every seed.
+
+    Attributes:
+        episode: start and goal.
+    """
+
+    episode: Episode
+
+    def __call__(self, seed: int) -> Episode:
+        """The episode."""
+        return self.episode
+
+    def draw(self, key: PRNGKeyArray) -> Episode:
+        """The episode as arrays of JAX, whatever the key."""
+        return jax.tree.map(_as_float, self.episode)
+
+
+@dataclass(frozen=True, eq=False)
+class TurnedStart:
+    """A flat body and its goal, both turned by the same random angle within 45 degrees.
+
+    Attributes:
+        body: the body.
+        goal: goal of the body that is not turned, shape (N, 3), metres.
+    """
+
+    body: Body
+    goal: goals.Positions
+
+    def __call__(self, seed: int) -> Episode:
+        """The episode of a seed."""
+        angle = np.random.default_rng(seed).uniform(-LARGEST_ANGLE, LARGEST_ANGLE)
+        return Episode(goals.flat(self.body, angle), goals.turn(self.goal, angle))
+
+    def draw(self, key: PRNGKeyArray) -> Episode:
+        """The episode of a key; another one than that of any seed."""
+        angle = jax.random.uniform(key, minval=-LARGEST_ANGLE, maxval=LARGEST_ANGLE)
+        start, goal = goals.flat(self.body), self.goal
+        return Episode(_turn(_as_float(start), angle), _turn(_as_float(goal), angle))
+
+
+@dataclass(frozen=True, eq=False)
+class CrumpledStart:
+    """A body after four random picks (see `crumple`), and one goal.
+
+    Attributes:
+        body: starts straight or flat on the table.
+        goal: shape (N, 3), metres.
+    """
+
+    body: Body
+    goal: goals.Positions
+
+    def __call__(self, seed: int) -> Episode:
+        """The episode of a seed; it takes a simulation."""
+        return Episode(crumple(self.body, seed), self.goal)
+
+
+def _turn(positions: Float[Array, "N 3"], angle: Float[Array, ""]) -> Float[Array, "N 3"]:
+    """`goals.turn` in JAX, without the matrix product that some devices round coarsely."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    x, y, z = positions.T
+    return jnp.stack([x * cos - y * sin, x * sin + y * cos, z], axis=1)
+
+
+def _as_float(positions: goals.Positions) -> Float[Array, "N 3"]:
+    return jnp.asarray(positions, dtype=float)
