@@ -13,7 +13,7 @@ from scipy import stats
 from jaxsimp import goals, viz
 from jaxsimp.bodies import cloth, from_mesh, rope
 from jaxsimp.bodies.garments import skirt
-from jaxsimp.bodies.meshes import boundary_edges
+from jaxsimp.bodies.topology import boundary_edges
 from jaxsimp.simplification import FitStatus, KeyPoints
 
 
@@ -167,7 +167,7 @@ def assert_is_at(axes, body, positions):
     if len(body.faces):
         (outline,) = (each for each in axes.collections if isinstance(each, Line3DCollection))
         drawn = np.concatenate(outline._segments3d)
-        wanted = np.concatenate(positions[boundary_edges(body.faces)])
+        wanted = np.concatenate(positions[boundary_edges(body.faces)[0]])
     else:
         drawn, wanted = np.transpose(axes.lines[0].get_data_3d()), positions
     np.testing.assert_allclose(drawn, wanted)
