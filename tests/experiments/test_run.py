@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import plan_report, plans, run
-from jaxsimp.planning import ENCODINGS, CEMConfig, load_plan
+from experiments import plan_options, plan_report, plans, run
+from jaxsimp.planning import CEM, ENCODINGS
+from jaxsimp.records import load_plan
 from jaxsimp.tasks import make_task, score
 
 ROOT = Path(__file__).parents[2]
@@ -106,16 +107,16 @@ def test_plans_load_and_end_in_the_score_of_their_run(folder):
     summary = finished(folder)
     key_points = {model["task"]: model["key_points"] for model in summary["models"]}
     for row in summary["runs"]:
-        actions, arrays = load_plan(folder / row["plan"])
+        plan = load_plan(folder / row["plan"])
         task = make_task(row["task"], 9)
-        assert arrays["positions"].shape == (3, task.body.num_particles, 3)
-        last = np.asarray(arrays["positions"][-1], np.float32)
+        assert plan.positions.shape == (3, task.body.num_particles, 3)
+        last = np.asarray(plan.positions[-1], np.float32)
         episode = task.episode_fn(row["seed"])
         found = score(task, episode, jnp.asarray(last))
         # float32, compiled with other code around it
         assert row["final_score"] == pytest.approx(float(found), abs=1e-5)
         if row["action_space"] == "key_points":
-            picked = set(np.asarray(actions.pick).ravel().tolist())
+            picked = set(np.asarray(plan.actions.pick).ravel().tolist())
             assert picked <= {*key_points[row["task"]], -1}
 
 
@@ -232,7 +233,7 @@ def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch,
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "run_study", interrupt)
+    monkeypatch.setattr(plan_options, "run_study", interrupt)
     assert command(*OPTIONS, "--out", tmp_path / "new") == 130
     assert "goes on" in capsys.readouterr().out
 
@@ -254,8 +255,8 @@ def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch,
         (("--elite-fraction", "2"), "elite_fraction is 2.0; give"),
         (("--smoothing", "1"), "smoothing is 1.0; give"),
         (("--initial-spread", "nan"), "initial_spread is nan; give"),
-        (("--resolution", "3"), "resolution is 3; a task needs at least 5"),
-        (("--resolution", "0"), "resolution is 0; a task needs at least 5"),
+        (("--resolution", "3"), "resolution is 3; a task needs a whole number"),
+        (("--resolution", "0"), "resolution is 0; a task needs a whole number"),
         (("--tasks", "rope_folding", "rope_folding"), "task 'rope_folding' is given twice"),
         (("--pick-encodings", "categorical", "categorical"), "'categorical' is given twice"),
     ],
@@ -328,7 +329,7 @@ def test_options_replace_the_settings_of_the_budget():
     ).configuration()
     task = study.task("rope_folding")
     config = study.search_config(task)
-    assert config == CEMConfig(
+    assert config == CEM(
         num_iterations=20,
         population=11,
         initial_populations=1,

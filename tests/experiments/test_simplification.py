@@ -9,7 +9,7 @@ import pytest
 from experiments import run, simplification, simplification_report
 from experiments.ideal_goals import FOLDS, LINES, NOISES
 from experiments.settled_goals import SETTLED_FOLDS
-from experiments.simplification import CLOTH_LEVELS, ROPE_LEVELS, ROWS_FILE, Study
+from experiments.simplification import CLOTH_LEVELS, ROPE_LEVELS, ROWS_FILE, SimplificationStudy
 
 
 def study(**changes):
@@ -20,7 +20,7 @@ def study(**changes):
         "cloth_sizes": (25, 64),
         "settled_size": 13,
     }
-    return Study(**(fields | changes))
+    return SimplificationStudy(**(fields | changes))
 
 
 def command(*options):

@@ -14,10 +14,10 @@ import pytest
 from experiments import run, transfer
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
-from jaxsimp.engines import MassSprings, make_ensemble
+from jaxsimp.engines import Execution, MassSprings, make_ensemble
 from jaxsimp.engines.mujoco.model import VARIANTS
-from jaxsimp.planning import CEMConfig, Layout, Planner, load_plan, save_plan
-from jaxsimp.records import read_rows
+from jaxsimp.planning import Planner
+from jaxsimp.records import load_plan, read_rows, save_plan
 from jaxsimp.tasks import make_task, score, task_names
 
 TASKS = ("rope_straightening", "cloth_diagonal_folding")
@@ -82,7 +82,7 @@ def test_scores_are_those_of_the_settled_positions(folder, variant):
             (folder / row["plan"], row["final_score"]),
             (replay_path(folder, row, variant), row[f"mujoco_{variant}_score"]),
         ):
-            last = load_plan(path)[1]["positions"][-1]
+            last = load_plan(path).positions[-1]
             expected = float(score(task, episode, jnp.asarray(last, dtype=float)))
             assert found == pytest.approx(expected, abs=1e-5)  # float32, compiled otherwise
 
@@ -159,12 +159,10 @@ def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
     # The search's cost of the plan is the one of the ensemble, not that of the body's own physics.
     task = make_task("rope_folding", 7)
     task = dataclasses.replace(task, num_actions=1)
-    plan = jax.tree.map(lambda array: array[None], load_plan(out / row["plan"])[0])
+    plan = jax.tree.map(lambda array: array[None], load_plan(out / row["plan"]).actions)
     robust, nominal = (
-        Planner(task, CEMConfig(1, 1, 1), Layout(), ensemble=ensemble).costs(
-            task.episode_fn(0), plan
-        )[0]
-        for ensemble in (make_ensemble(task, 4), None)
+        Planner(task, engine).costs(task.episode_fn(0), plan)[0]
+        for engine in (make_ensemble(task, 4), MassSprings())
     )
     (found,) = read_rows(out / "runs.jsonl")
     assert found["final_cost"] == pytest.approx(robust, rel=1e-5)  # float32
@@ -199,9 +197,8 @@ def test_plans_with_self_contact_are_those_of_its_physics(tmp_path):
     (found,) = read_rows(out / "runs.jsonl")
     assert row["planning"] == "self_contact"
     task = dataclasses.replace(make_task("rope_folding", 7), num_actions=1)
-    plan = load_plan(out / row["plan"])[0]
-    planner = Planner(task, CEMConfig(1, 1, 1), Layout(), engine=MassSprings(self_contact=True))
-    execution = planner.execute(task.episode_fn(0), plan)
+    plan = load_plan(out / row["plan"]).actions
+    execution = MassSprings(self_contact=True).executor(task)(task.episode_fn(0), plan)
     assert execution.missed is not None
     assert found["final_score"] == pytest.approx(execution.score, abs=1e-5)  # float32
 
@@ -211,13 +208,14 @@ def test_a_plan_is_replayed_from_the_start_that_it_was_made_for(tmp_path, monkey
     monkeypatch.setattr(transfer, "VARIANTS", {"fast": VARIANTS["fast"]})
     (tmp_path / transfer.REPLAYS_FOLDER).mkdir()
     task, seed = make_task("cloth_side_folding", 5), 3
-    plan = scripted_plan(task, task.episode_fn(seed))
-    path = tmp_path / "plan.npz"
-    save_plan(path, plan, np.zeros((task.num_actions + 2, 25, 3)))
+    episode = task.episode_fn(seed)
+    plan, path = scripted_plan(task, episode), tmp_path / "plan.npz"
+    nothing = Execution(np.zeros((task.num_actions + 2, 25, 3)), 0.0)
+    save_plan(path, task, episode, plan, nothing, engine=MassSprings())
     row = {"task": task.name, "action_space": "scripted", "seed": seed, "plan": path.name}
     (done,) = transfer._replay_task(task, [transfer.Case(row, path)], tmp_path)
-    assert done["mujoco_fast_score"] > 0.5  # of another start the corners are elsewhere
-    frames = load_plan(replay_path(tmp_path, row, "fast"))[1]["positions"]
+    assert done["mujoco_fast_status"] == "FINE"
+    frames = load_plan(replay_path(tmp_path, row, "fast")).positions
     np.testing.assert_allclose(frames[0], task.episode_fn(seed).start, atol=1e-7)  # float32
 
 
