@@ -1,7 +1,44 @@
-"""Tasks: a body, where it starts, where it should end, and what a state costs.
+"""Tasks: a body, where it starts, where it should end, and what states and actions cost.
 
-A task is made by a factory that takes the resolution; `register` adds one to the registry. The
-four tasks of the paper are after SoftGym and fabric-vsf.
+A task is made by a factory that takes the resolution; `register` adds the factory to the registry.
+The four tasks of the paper are after SoftGym and fabric-vsf. A task of one's own is one file:
+
+```python
+import jax.numpy as jnp
+
+from jaxsimp import goals
+from jaxsimp.bodies import rope
+from jaxsimp.tasks import Episode, FixedStart, Task, register
+
+
+def terminal_cost(episode, state):
+    # Largest distance of a particle to its goal, metres.
+    return jnp.linalg.norm(state.position - episode.goal, axis=1).max()
+
+
+def running_cost(episode, state, action):
+    # The same, and a little for long ways.
+    return terminal_cost(episode, state) + 0.01 * jnp.abs(action.displacement).sum()
+
+
+@register(full=41, quick=21)
+def rope_letter_s(resolution):
+    body = rope(resolution)
+    goal = goals.letter(body, "S")
+    start = FixedStart(Episode(goals.straight(body), goal))
+    return Task(
+        body=body,
+        goal=goal,
+        episode_fn=start,
+        draw_fn=start.draw,
+        running_cost=running_cost,
+        terminal_cost=terminal_cost,
+        limits=(0.15, 0.15, 0.15),
+    )
+```
+
+Functions of a module and instances of its classes can be pickled, and so can a task that is made of
+them; a lambda cannot.
 """
 
 # The modules of tasks register them, in this order.

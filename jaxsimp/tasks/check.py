@@ -1,4 +1,4 @@
-"""What a task refuses when it is made: numbers out of range, functions that JAX cannot compile."""
+"""Checks of a new task: its numbers are in range, and JAX can compile its functions."""
 
 import inspect
 from collections.abc import Callable
@@ -16,27 +16,27 @@ from jaxsimp.tasks.episode import DrawFn, Episode, RunningCost, TerminalCost
 
 
 def check_count(name: str, value: object, least: int) -> None:
-    """Refuse what is no whole number, or one below `least`.
+    """Refuse a value that is no whole number of at least `least`.
 
     Raises:
-        ValueError: if it is.
+        ValueError: if the value is none.
     """
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name} is {value}; give a whole number of at least {least}")
 
 
 def check_seconds(name: str, value: object) -> None:
-    """Refuse what is no positive, finite number.
+    """Refuse a value that is no positive, finite number.
 
     Raises:
-        ValueError: if it is.
+        ValueError: if the value is none.
     """
     if not _is_positive(value):
         raise ValueError(f"{name} is {value}; give a positive, finite number of seconds")
 
 
 def check_limits(limits: object) -> None:
-    """Refuse what are not three positive, finite numbers.
+    """Refuse limits that are not three positive, finite numbers.
 
     Raises:
         ValueError: if they are not.
@@ -56,8 +56,8 @@ def check_costs(
     The costs are traced with arrays that have a shape and no values; nothing is computed.
 
     Args:
-        running_cost: of an episode, a state and an action.
-        terminal_cost: of an episode and a state.
+        running_cost: cost of an episode, a state and an action.
+        terminal_cost: cost of an episode and a state.
         num_particles: number of particles of the body, `N`.
         num_pickers: number of pickers, `G`.
 
@@ -70,10 +70,10 @@ def check_costs(
 
 
 def check_draw(draw_fn: DrawFn, num_particles: int) -> None:
-    """Refuse what draws no episode of `num_particles` by a key, in pure JAX.
+    """Refuse a function that does not make an episode of `num_particles` from a key.
 
     Raises:
-        ValueError: if it fails, or returns anything else.
+        ValueError: if the function fails under a trace, or returns anything else.
     """
 
     def draw() -> list[Array | np.ndarray]:
@@ -101,10 +101,10 @@ def _check_cost(
     """Refuse one cost.
 
     Args:
-        name: of the cost.
-        cost: what is checked.
+        name: name of the cost.
+        cost: the cost.
         examples: makes an episode, a state and an action, under a trace.
-        arguments: names of those of the examples that the cost is called with.
+        arguments: names of the arguments of the cost: the first of the examples.
     """
     try:
         inspect.signature(cost).bind(*arguments)

@@ -21,11 +21,11 @@ from jaxsimp.dynamics import (
 )
 
 FARTHEST = (0.3, 0.3, 0.6)
-"""That a pick carries along x and y, either way, and up, metres."""
+"""Largest displacement of a pick along x and y, either way, and up, metres."""
 SECONDS = 0.5
-"""That a pick takes."""
+"""Duration of a pick, seconds."""
 TOP_SPEED = 1.5 * float(np.linalg.norm(FARTHEST)) / SECONDS
-"""Metres per second: at the middle of the longest way."""
+"""Speed of a pick at the middle of the longest way, metres per second."""
 
 
 def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
@@ -35,8 +35,8 @@ def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
     touches itself: parts lie on each other, and what is pulled apart need not pass through itself.
 
     Args:
-        body: starts straight or flat on the table.
-        seed: of the random picks.
+        body: the body; it starts straight or flat on the table.
+        seed: seed of the random picks.
     """
     key_pick, key_move = jax.random.split(jax.random.key(seed))
     pick = jax.random.randint(key_pick, (4, 1), 0, body.num_particles)

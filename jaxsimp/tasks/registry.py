@@ -16,7 +16,7 @@ TaskFactory = Callable[[int], Task]
 
 @dataclass(frozen=True)
 class _Entry:
-    """What `register` was told of a task."""
+    """A registered task: the arguments of `register` and its factory."""
 
     factory: TaskFactory
     full: int
@@ -37,7 +37,7 @@ def register(
     Args:
         full: resolution of the task as it is studied.
         quick: resolution for tests and smoke runs.
-        group: of tasks that are studied together: "paper" or "goals" here.
+        group: name of a group of tasks that are studied together: "paper" or "goals" here.
 
     Raises:
         ValueError: if the name is taken.

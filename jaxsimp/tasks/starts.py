@@ -1,7 +1,7 @@
 """Starts and goals of episodes: always the same, turned at random, or crumpled.
 
-Called with a seed they make an episode in NumPy. Those that need no simulation also `draw` one by
-a key, in pure JAX.
+A start is called with a seed and makes an episode in NumPy. A start that needs no simulation also
+has `draw`, which makes an episode from a key, in pure JAX.
 """
 
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ class TurnedStart:
         return Episode(goals.flat(self.body, angle), goals.turn(self.goal, angle))
 
     def draw(self, key: PRNGKeyArray) -> Episode:
-        """The episode of a key; another one than that of any seed."""
+        """The episode of a key; keys and seeds give different angles."""
         angle = jax.random.uniform(key, minval=-LARGEST_ANGLE, maxval=LARGEST_ANGLE)
         start, goal = goals.flat(self.body), self.goal
         return Episode(_turn(_as_float(start), angle), _turn(_as_float(goal), angle))
@@ -68,7 +68,7 @@ class CrumpledStart:
     """A body after four random picks (see `crumple`), and one goal.
 
     Attributes:
-        body: starts straight or flat on the table.
+        body: the body; it starts straight or flat on the table.
         goal: shape (N, 3), metres.
     """
 

@@ -23,25 +23,26 @@ from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, Termi
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is asked of a planner.
+    """A body, its start and goal, and the costs that a planner minimises.
 
     Attributes:
-        body: what is manipulated.
-        goal: the goal configuration that key points are found in, shape (N, 3), metres.
-        episode_fn: from a seed to start and goal.
+        body: the body that is manipulated.
+        goal: positions that key points are found in, shape (N, 3), metres.
+        episode_fn: makes start and goal from a seed.
         running_cost: cost of an episode, the state at the end of an action, and that action,
             shapes (G,) and (G, 3): a scalar, at least 0; pure JAX.
         terminal_cost: cost of an episode and the settled state: a scalar, at least 0; pure JAX.
         limits: largest displacement of one action along x, y, z, metres.
-        num_actions: actions in a plan, `T`.
-        num_pickers: `G`.
-        action_seconds: that one action takes.
-        settle_actions: as many times `action_seconds` pass, with nothing held, after the
-            last action and before the plan is scored.
+        num_actions: number of actions in a plan, `T`.
+        num_pickers: number of pickers, `G`.
+        action_seconds: duration of one action, seconds.
+        settle_actions: time that passes with nothing held, after the last action and before the
+            plan is scored, in multiples of `action_seconds`.
         longest_time_step: bound on the time step of the simulation, seconds.
-        draw_fn: from a key to start and goal, pure JAX; None where starts are made by seed only.
-        name: of a registered task that of its factory, see `register`.
-        resolution: that a registered task was made with, see `make_task`; None of another one.
+        draw_fn: makes start and goal from a key, in pure JAX; None where only a seed makes them.
+        name: name of the task; for a registered task that of its factory, see `register`.
+        resolution: resolution that a registered task was made with, see `make_task`; None for a
+            task that is not registered.
 
     Raises:
         ValueError: if the goal is refused (see `goals.check_goal`), a number is out of its range,
@@ -80,10 +81,10 @@ class Task:
     def draw_episode(self, key: PRNGKeyArray) -> Episode:
         """A random episode, drawn by a key: pure JAX, to which `jit` and `vmap` over keys apply.
 
-        The starts are as those of `episode_fn`; the start of no key is that of a seed.
+        Starts and goals have the same distribution as those of `episode_fn`.
 
         Raises:
-            ValueError: if the starts of this task are made by seed only.
+            ValueError: if the task has no `draw_fn`, as its starts need a simulation.
         """
         if self.draw_fn is None:
             raise ValueError(
@@ -130,19 +131,19 @@ def score(
 ) -> Float[Array, ""]:
     """Normalised score `(c_0 - c) / c_0`: 1 where the cost is 0, 0 where it is that of the start.
 
-    `c_0` and `c` are terminal costs of the start, at rest, and of the state. Of a start that costs
-    nothing the score is the limit of small `c_0`: 1 where `c` is 0, too, and minus infinity where
-    it is more. The score is not a number only where a cost is none.
+    `c_0` and `c` are the terminal costs of the start, at rest, and of the state. Where `c_0` is 0
+    the score is its limit for small `c_0`: 1 if `c` is 0 too, minus infinity if `c` is more. The
+    score is NaN only if a cost is NaN.
 
     Args:
-        task: what is asked.
+        task: the task.
         episode: start and goal.
-        state: that is scored, or its positions, shape (N, 3), metres, at rest.
+        state: the state to score, or positions at rest, shape (N, 3), metres.
     """
     state = state if isinstance(state, State) else at_rest(state)
     start = task.terminal_cost(episode, at_rest(episode.start))
     cost = task.terminal_cost(episode, state)
     relative = start != 0
     ratio = (start - cost) / jnp.where(relative, start, 1.0)
-    of_free_start = jnp.where(cost > 0, -jnp.inf, 1.0 - cost)  # not a number where the cost is none
+    of_free_start = jnp.where(cost > 0, -jnp.inf, 1.0 - cost)  # NaN if the cost is NaN
     return jnp.where(relative, ratio, of_free_start)
