@@ -37,7 +37,7 @@ def test_ids_survive_a_decimation():
     faces = bodies.cloth((7, 7)).faces
     triangles = decimate(pymeshlab, points, faces, 20)
     meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.LinkedMesh(points, faces))
+    meshes.add_mesh(pymeshlab.Mesh(points, faces))
     meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=20, **meshlab.PARAMETERS)
     mesh = meshes.current_mesh()
     expected = mesh.vertex_matrix()[mesh.face_matrix()]
@@ -48,7 +48,7 @@ def test_ids_survive_a_decimation():
 def test_every_parameter_of_meshlab_is_passed():
     pymeshlab = pytest.importorskip("pymeshlab")
     meshes = pymeshlab.MeshSet(verbose=False)
-    meshes.add_mesh(pymeshlab.LinkedMesh(np.eye(3), np.array([[0, 1, 2]])))
+    meshes.add_mesh(pymeshlab.Mesh(np.eye(3), np.array([[0, 1, 2]])))
     names = meshes.filter_parameter_values("meshing_decimation_quadric_edge_collapse")
     assert set(names) == {"targetfacenum", *meshlab.PARAMETERS}
 
