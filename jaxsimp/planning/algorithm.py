@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from jaxsimp.planning.archive import Archive
@@ -35,8 +36,8 @@ class Told:
             (B, T, G, 3); None unless the algorithm wants them.
     """
 
-    costs: Float[Array, " B"]
-    gradients: Float[Array, "B T G 3"] | None = None
+    costs: Float[Array | np.ndarray, "*B"]
+    gradients: Float[Array | np.ndarray, "*B T G 3"] | None = None
 
 
 @runtime_checkable

@@ -5,6 +5,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsimp.planning.space import ActionSpace, Plans
@@ -26,8 +27,8 @@ class Archive:
     """
 
     plans: Plans
-    costs: Float[Array, " M"]
-    filled: Bool[Array, " M"]
+    costs: Float[Array, "*E M"]
+    filled: Bool[Array, "*E M"]
 
     def best(self, count: int) -> Plans:
         """The best plans, copies of the best where there are fewer."""
@@ -43,7 +44,7 @@ def empty_archive(space: ActionSpace, size: int) -> Archive:
 
 
 def archived(
-    archive: Archive, space: ActionSpace, plans: Plans, costs: Float[Array, " B"]
+    archive: Archive, space: ActionSpace, plans: Plans, costs: Float[Array | np.ndarray, " B"]
 ) -> Archive:
     """The archive with the best distinct of its own and of further plans; the older win ties."""
     plans = jax.tree.map(lambda *parts: jnp.concatenate(parts), archive.plans, plans)

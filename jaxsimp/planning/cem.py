@@ -135,7 +135,7 @@ class CEM(Defaults):
         elites, costs, filled = _best(
             self.num_elites,
             (state.elites, state.costs, filled),
-            (state.asked, told.costs, jnp.ones(self.population, bool)),
+            (state.asked, jnp.asarray(told.costs), jnp.ones(self.population, bool)),
         )
         count = state.count + 1
         distribution = jax.lax.cond(
@@ -158,8 +158,8 @@ class CEM(Defaults):
         return {"elite_costs": state.costs}
 
 
-Ranked = tuple[PyTree[Any], Float[Array, " M"], Bool[Array, " M"]]
-"""Samples, their costs, and where there are any."""
+Ranked = tuple[PyTree[Any], Float[Array, " _"], Bool[Array, " _"]]
+"""Samples, their costs, and where there are any, as many of each."""
 
 
 def _best(count: int, *pools: Ranked) -> Ranked:

@@ -6,7 +6,7 @@ that is not in JAX, or from a robot.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -19,6 +19,7 @@ from jaxsimp.engines.rollouts import as_float
 from jaxsimp.planning.algorithm import Algorithm, Sequence, Told, Wants
 from jaxsimp.planning.archive import Archive, empty_archive
 from jaxsimp.planning.loop import (
+    Keys,
     Optimum,
     Progress,
     Recorded,
@@ -69,7 +70,7 @@ def search_on_host(
     """
 
     def run_stage(
-        stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: PRNGKeyArray
+        stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: Keys
     ) -> tuple[Progress, Actions, Recorded]:
         exchanges, records = compiled_exchanges(stage, space, len(archive.costs)), []
         progress = exchanges.begin(space, archive, failed)
@@ -79,12 +80,12 @@ def search_on_host(
             progress, recorded = exchanges.absorb(space, progress, plans, told)
             records.append(recorded)
             on_ask()
-        recorded = jax.tree.map(lambda *leaves: np.stack(leaves), *records)
+        recorded = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *records)
         return progress, exchanges.finish(space, progress), recorded
 
     def cost_of_one(actions: Actions) -> Told:
         one = jax.tree.map(lambda leaf: leaf[None], actions)
-        return Told(evaluate("cost", one).costs[0])
+        return Told(jnp.asarray(evaluate("cost", one).costs)[0])
 
     return search(algorithm, space, key, run_stage, cost_of_one)
 
@@ -108,24 +109,37 @@ def _compile(
     space = ActionSpace(ids, limits, num_actions, num_pickers)
     archive = empty_archive(space, archive_size)
     failed, key = jnp.zeros((), jnp.int32), jax.random.key(0)
-    lowered_begin = _lower(begin, algorithm, space, archive, failed, options=QUICK)
-    lowered_ask = _lower(ask, algorithm, space, lowered_begin.out_info, key, options=QUICK)
-    progress, plans, actions = lowered_ask.out_info
-    told = _told(algorithm, actions)
-    lowered_absorb = _lower(absorb, algorithm, space, progress, plans, told)
-    lowered_finish = _lower(finish, algorithm, space, progress, options=QUICK)
-    lowered = (lowered_begin, lowered_ask, lowered_absorb, lowered_finish)
-    return Exchanges(*(each.compile() for each in lowered))
+    begun = _compiled(begin, algorithm, space, archive, failed, options=QUICK)
+    progress = begun(space, archive, failed)
+    asked = _compiled(ask, algorithm, space, progress, key, options=QUICK)
+    progress, plans, actions = asked(space, progress, key)
+    told = _no_costs(algorithm, actions)
+    absorbed = _compiled(absorb, algorithm, space, progress, plans, told)
+    finished = _compiled(finish, algorithm, space, progress, options=QUICK)
+    return Exchanges(begun, asked, absorbed, finished)
 
 
-def _lower(
+def _compiled(
     fn: Callable[..., Any], algorithm: Algorithm, *arguments: Any, options: Any = None
-) -> jax.stages.Lowered:
-    """The function of arguments of these shapes, lowered."""
-    return jax.jit(partial(fn, algorithm), compiler_options=options).lower(*arguments)
+) -> Callable[..., Any]:
+    """The function, compiled for arguments of these shapes.
+
+    It is compiled of leaves: trees of shapes, and not of arrays, are never made.
+    """
+    tree, out = jax.tree.structure(arguments), []
+
+    def of_leaves(leaves: list[Array]) -> list[Array]:
+        results, out_tree = jax.tree.flatten(fn(algorithm, *jax.tree.unflatten(tree, leaves)))
+        out.append(out_tree)
+        return results
+
+    jitted = jax.jit(of_leaves, compiler_options=options)
+    compiled = jitted.lower(jax.tree.leaves(arguments)).compile()
+    return lambda *arguments: jax.tree.unflatten(out[0], compiled(jax.tree.leaves(arguments)))
 
 
-def _told(algorithm: Algorithm, actions: Any) -> Told:
-    """The shapes of what the algorithm is told of plans."""
-    costs: Any = jax.ShapeDtypeStruct(actions.pick.shape[:1], jnp.result_type(float))
-    return Told(costs, actions.displacement if algorithm.wants == "gradient" else None)
+def _no_costs(algorithm: Algorithm, actions: Actions) -> Told:
+    """What the algorithm is told of plans, all zero."""
+    costs = jnp.zeros(len(actions.pick), float)
+    gradients = jnp.zeros_like(actions.displacement) if algorithm.wants == "gradient" else None
+    return Told(costs, gradients)

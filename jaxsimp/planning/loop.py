@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from jaxsimp.dynamics import Actions
 from jaxsimp.planning.algorithm import Algorithm, Sequence, Told, Wants, stages
@@ -45,7 +45,7 @@ class Progress:
 )
 @dataclass(frozen=True)
 class Optimum:
-    """What a search found.
+    """What a search found; `jax.vmap` may add axes before all shapes.
 
     Attributes:
         actions: the plan, shapes (T, G) and (T, G, 3).
@@ -57,20 +57,22 @@ class Optimum:
     """
 
     actions: Actions
-    cost: Float[Array, ""]
+    cost: Float[Array, "*E"]
     archive: Archive
-    best_costs: Float[Array, " asks"]
+    best_costs: Float[Array, "*E asks"]
     traces: tuple[dict[str, Array], ...]
-    failed: Int[Array, ""]
+    failed: Int[Array, "*E"]
 
 
+Keys = Shaped[Array, "asks *key"]
+"""A key for each question."""
 RunStage = Callable[
-    [Algorithm, Archive, Int[Array, ""], PRNGKeyArray], tuple[Progress, Actions, "Recorded"]
+    [Algorithm, Archive, Int[Array, ""], Keys], tuple[Progress, Actions, "Recorded"]
 ]
 """Runs one algorithm from an archive and a count of failures, an exchange for each key: the
 progress after the last, the actions that it returns, and a record."""
-Recorded = tuple[Float[Array, " asks"], dict[str, Array]]
-"""Lowest cost so far after each exchange, and what `Algorithm.trace` gave."""
+Recorded = tuple[Float[Array, "*asks"], dict[str, Array]]
+"""Lowest cost so far, and what `Algorithm.trace` gave, after one exchange or after each."""
 
 
 def optimize(
@@ -93,7 +95,7 @@ def optimize(
     space = problem.space
 
     def run_stage(
-        stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: PRNGKeyArray
+        stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: Keys
     ) -> tuple[Progress, Actions, Recorded]:
         evaluate = evaluation(problem, stage.wants)
 
@@ -133,8 +135,8 @@ def search(
         archive, failed = progress.archive, progress.failed
         records.append(recorded)
     cost = archive.costs[0]
-    if jax.eval_shape(stage.answer, space, progress.state) is not None:
-        cost = finite(evaluate(actions)).costs
+    if jax.eval_shape(lambda: jax.tree.leaves(stage.answer(space, progress.state))):
+        cost = jnp.asarray(finite(evaluate(actions)).costs)
         failed = failed + jnp.isinf(cost)
     best_costs = jnp.concatenate([costs for costs, _ in records])
     return Optimum(actions, cost, archive, best_costs, tuple(trace for _, trace in records), failed)

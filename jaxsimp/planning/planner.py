@@ -38,7 +38,7 @@ class Plan:
 
     Attributes:
         actions: shapes (T, G) and (T, G, 3).
-        optimum: costs by question, the best distinct plans, and failures, on the host.
+        optimum: costs by question, the best distinct plans, and failures.
         num_rollouts: plans evaluated.
         price: of the search, in rollouts: a gradient is more than one, see `PRICES`.
         seconds: that the search took, compilation not included.
@@ -118,9 +118,9 @@ class Planner:
         bill = _Bill(partial(self._told, as_float(episode)))
         start = time.perf_counter()
         optimum = search_on_host(algorithm, space, jax.random.key(seed), bill, on_ask)
-        optimum = jax.device_get(optimum)
+        jax.block_until_ready(optimum)
         return Plan(
-            actions=jax.tree.map(jnp.asarray, optimum.actions),
+            actions=optimum.actions,
             optimum=optimum,
             num_rollouts=bill.num_plans,
             price=bill.price,

@@ -5,6 +5,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp.planning.algorithm import Defaults, Told, Wants
@@ -18,7 +19,7 @@ class Ranking:
     """Plans and what they cost when they have settled, leading axis `num_plans`."""
 
     plans: Plans
-    costs: Float[Array, " B"]
+    costs: Float[Array | np.ndarray, " B"]
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,9 @@ def as_candidates(
             f"candidates {named}; give at least one of the ids 0 to {num_particles - 1} of a body "
             f"of {num_particles} particles"
         )
-    if len(np.unique(given)) < len(given):
-        raise ValueError("candidates names a particle twice; give each id once")
+    ids, counts = np.unique(given, return_counts=True)
+    if counts.max() > 1:
+        raise ValueError(
+            f"candidates names particle {ids[counts.argmax()]} twice; give each id once"
+        )
     return given

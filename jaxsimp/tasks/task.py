@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -142,8 +143,28 @@ def score(
     """
     state = state if isinstance(state, State) else at_rest(state)
     start = task.terminal_cost(episode, at_rest(episode.start))
-    cost = task.terminal_cost(episode, state)
-    relative = start != 0
-    ratio = (start - cost) / jnp.where(relative, start, 1.0)
-    of_free_start = jnp.where(cost > 0, -jnp.inf, 1.0 - cost)  # NaN if the cost is NaN
-    return jnp.where(relative, ratio, of_free_start)
+    ratio = _saved(start, task.terminal_cost(episode, state))
+
+    # Division by a start of no cost gives -inf, or no number where both costs are zero. The cost is
+    # taken again in that case alone: a second use of it would change how XLA rounds the ratio.
+    def of_free_start(state: State) -> Float[Array, ""]:
+        cost = task.terminal_cost(episode, state)
+        return jnp.where(cost == 0, 1.0, jnp.nan).astype(ratio.dtype)
+
+    return jax.lax.cond(jnp.isnan(ratio), of_free_start, lambda _: ratio, state)
+
+
+@jax.custom_jvp
+def _saved(start: Float[Array, ""], cost: Float[Array, ""]) -> Float[Array, ""]:
+    """The part of the start's cost that is saved; its gradient is 0 where the start has no cost."""
+    return (start - cost) / start
+
+
+@_saved.defjvp
+def _saved_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    start, cost = primals
+    divisor = jnp.where(start != 0, start, 1.0)
+    change = (tangents[0] * cost / divisor - tangents[1]) / divisor
+    return _saved(start, cost), jnp.where(start != 0, change, 0.0)

@@ -2,17 +2,26 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxsimp import goals
 from jaxsimp.dynamics import NONE, Actions, State, at_rest
-from jaxsimp.engines import MassSprings
-from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner
+from jaxsimp.engines import (
+    Execution,
+    ExecutionStatus,
+    Layout,
+    MassSprings,
+    MuJoCo,
+    replay,
+)
+from jaxsimp.engines.rollouts import RolloutExecutor
+from jaxsimp.planning import CEM, Planner, Reranking, Sequence, action_space, price
 from jaxsimp.tasks import make_task
 
-CONFIG = CEMConfig(num_iterations=8, population=32, initial_populations=2)
+ALGORITHM = CEM(num_iterations=8, population=32, initial_populations=2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,9 +37,22 @@ class Gliding:
 
     def rollout(self, physics, state, actions, observe):
         moves = physics["share"] * actions.displacement.mean(axis=1)
-        moves = jnp.cumsum(moves, axis=0)
-        states = [State(state.position + move[None], state.velocity) for move in moves]
-        return states[-1], jnp.stack([observe(each) for each in states])
+
+        def act(state, step):
+            move, action = step
+            state = State(state.position + move[None], state.velocity)
+            return state, observe(state, action)
+
+        return jax.lax.scan(act, state, (moves, actions))
+
+    def risk(self, costs):
+        return costs
+
+    def chunk_size(self, physics):
+        return 4
+
+    def executor(self, task):
+        return RolloutExecutor(task, self, self.physics(task))
 
 
 def glided(share: float):
@@ -40,7 +62,7 @@ def glided(share: float):
     episode = task.episode_fn(0)
     episode = dataclasses.replace(episode, goal=np.asarray(episode.start) + shift)
     task = dataclasses.replace(task, num_actions=2)
-    return episode, Planner(task, CONFIG, Layout(4, 1), Gliding(share))
+    return episode, Planner(task, Gliding(share), Gliding(share), Layout(4, 1))
 
 
 def test_the_engine_carries_out_the_plan():
@@ -56,22 +78,22 @@ def test_the_engine_carries_out_the_plan():
     assert done.score == pytest.approx(0.5, abs=1e-5)  # half the way
 
 
-def test_a_plan_is_executed_by_the_judge():
+def test_a_plan_is_executed_by_the_evaluator():
     episode, planner = glided(1.0)
-    judged = Planner(planner.task, CONFIG, Layout(4, 1), Gliding(1.0), judge=Gliding(0.5))
+    evaluated = Planner(planner.task, Gliding(1.0), Gliding(0.5), Layout(4, 1))
     moves = jnp.full((2, 2, 3), jnp.array([0.05, 0.0, 0.0]))
     actions = Actions(jnp.full((2, 2), NONE), moves)
     assert planner.execute(episode, actions).score == pytest.approx(1.0, abs=1e-5)
-    assert judged.execute(episode, actions).score == pytest.approx(0.5, abs=1e-5)
+    assert evaluated.execute(episode, actions).score == pytest.approx(0.5, abs=1e-5)
     batch = Actions(actions.pick[None], actions.displacement[None])
-    np.testing.assert_array_equal(judged.costs(episode, batch), planner.costs(episode, batch))
+    np.testing.assert_array_equal(evaluated.costs(episode, batch), planner.costs(episode, batch))
 
 
 @pytest.mark.slow
 def test_a_plan_is_executed_with_self_contact_unless_told_otherwise():
     task = make_task("cloth_side_folding", 9)
     # By default.
-    planner = Planner(task, CEMConfig(num_iterations=1, population=8))
+    planner = Planner(task)
     # One side laid on the other, its corners well inside: laid on an edge, corners of a cloth as
     # coarse as this one (cells of 38 mm, layers of 4 mm) slip past it.
     moves = np.array([[[0.0, 0.12, 0.1]] * 2, [[0.0, 0.12, -0.1]] * 2])
@@ -81,7 +103,7 @@ def test_a_plan_is_executed_with_self_contact_unless_told_otherwise():
     done = planner.execute(episode, carried)
     assert isinstance(done.missed, int)
     assert np.isfinite(done.positions).all()
-    without = Planner(task, CEMConfig(num_iterations=1, population=8), judge=MassSprings())
+    without = Planner(task, evaluator=MassSprings())
     plain = without.execute(episode, carried)
     assert plain.missed is None
     # Without it the corners come to lie on the table, with it on what lies there.
@@ -92,18 +114,18 @@ def test_a_plan_is_executed_with_self_contact_unless_told_otherwise():
 
 def test_a_plan_is_searched_with_the_engine():
     episode, planner = glided(1.0)
-    plan = planner.plan(episode, np.array([0, 4]), ENCODINGS["categorical"], 0)
+    plan = planner.plan(episode, np.array([0, 4]), ALGORITHM, 0)
     done = planner.execute(episode, plan.actions)
     # In our dynamics a plan that need not grasp anything could not come near.
     assert done.score > 0.7
     costs = [np.linalg.norm(done.positions[t] - episode.goal, axis=1).mean() for t in (1, 2, 3)]
-    assert plan.search.cost == pytest.approx(sum(costs), rel=1e-5)  # rounding
+    assert plan.optimum.cost == pytest.approx(sum(costs), rel=1e-5)  # rounding
 
 
 def test_an_engine_that_refuses_the_task_is_heard():
     task = dataclasses.replace(make_task("rope_letter_u", 5), num_pickers=1)
     with pytest.raises(ValueError, match="rope_letter_u has 1 pickers; it takes 2"):
-        Planner(task, CONFIG, engine=Gliding(1.0))
+        Planner(task, engine=Gliding(1.0))
 
 
 @pytest.mark.parametrize("engine", [MassSprings(), Gliding(0.5)], ids=["springs", "gliding"])
@@ -116,7 +138,7 @@ def test_a_rollout_observes_the_state_after_each_action_and_goes_on_from_any(eng
     first, rest = (Actions(pick[part], moves[part]) for part in (slice(0, 1), slice(1, None)))
     start = at_rest(task.episode_fn(0).start)
 
-    def observe(state):
+    def observe(state, action=None):
         return {"tip": state.position[0], "height": state.position[:, 2].mean()}
 
     final, seen = engine.rollout(physics, start, Actions(pick, moves), observe)
@@ -131,3 +153,77 @@ def test_a_rollout_observes_the_state_after_each_action_and_goes_on_from_any(eng
         joined = np.concatenate([before[name], later[name]])
         np.testing.assert_allclose(seen[name], joined, atol=1e-6)
         np.testing.assert_allclose(seen[name][-1], observe(final)[name], atol=1e-6)
+
+
+# --- what users write, and what fails ------------------------------------------------------------
+
+
+class Still:
+    """The least engine: nothing moves, and all scores are a half."""
+
+    def executor(self, task):
+        def execute(episode, actions):
+            frames = [np.asarray(episode.start)] * (len(actions.pick) + 2)
+            return Execution(np.stack(frames), 0.5)
+
+        return execute
+
+
+def test_an_engine_with_an_executor_alone_evaluates_and_does_not_search():
+    episode, planner = glided(1.0)
+    planner = Planner(planner.task, planner.engine, Still(), planner.layout)
+    plan = planner.plan(episode, np.array([0, 4]), ALGORITHM, 0)
+    done = planner.execute(episode, plan.actions)
+    assert done.score == 0.5
+    assert done.status == ExecutionStatus.FINE
+    np.testing.assert_array_equal(done.positions, np.stack([episode.start] * 4))
+    settled = Sequence((ALGORITHM, Reranking(2)))
+    with pytest.raises(ValueError, match=r"settled scores and the evaluator is .*Still.* give an"):
+        planner.plan(episode, np.array([0, 4]), settled, 0)
+
+
+def test_plans_are_ranked_by_what_the_evaluator_makes_of_them():
+    # The engine glides half as far as the evaluator: what costs least goes too far there.
+    episode, planner = glided(0.5)
+    planner = Planner(planner.task, Gliding(0.5), Gliding(1.0), Layout(4, 1))
+    algorithm = Sequence((ALGORITHM, Reranking(8)))
+    plan = planner.plan(episode, np.array([0, 4]), algorithm, 0)
+    plain = planner.plan(episode, np.array([0, 4]), ALGORITHM, 0)
+    scores = [planner.execute(episode, each.actions).score for each in (plan, plain)]
+    assert scores[0] >= scores[1]
+    # Oracle: each of the eight archived plans, carried out by itself.
+    space, archive = action_space(planner.task, np.array([0, 4])), plan.optimum.archive
+    each = [jax.tree.map(lambda leaf, i=i: leaf[i], archive.plans) for i in range(8)]
+    ranked = [planner.execute(episode, space.actions(one)).score for one in each]
+    assert archive.filled.all()
+    assert scores[0] == pytest.approx(max(ranked), abs=1e-6)  # float32, other machine code
+    assert plan.num_rollouts == plain.num_rollouts + 8 + 1  # and the cost of what is returned
+    assert plan.price == price(algorithm) + 1
+
+
+@pytest.mark.parametrize("move", [np.nan, np.inf])
+@pytest.mark.parametrize("self_contact", [False, True])
+def test_a_simulation_that_is_not_finite_is_a_status(move, self_contact):
+    task = make_task("rope_folding", 7)
+    task = dataclasses.replace(task, num_actions=1, settle_actions=1)
+    moves = jnp.full((1, 2, 3), move)
+    execute = MassSprings(self_contact).executor(task)
+    done = execute(task.episode_fn(0), Actions(jnp.array([[0, NONE]]), moves))
+    fine = np.isfinite(done.positions).all() and np.isfinite(done.score)
+    assert done.status == (ExecutionStatus.FINE if fine else ExecutionStatus.UNSTABLE)
+    # An infinite move is clipped to the limits; what is no number cannot be.
+    assert fine == np.isinf(move)
+    assert np.isfinite(done.positions[0]).all()
+
+
+def test_a_planner_executes_in_mujoco():
+    task = make_task("rope_folding", 7)
+    task = dataclasses.replace(task, num_actions=1, settle_actions=1)
+    planner = Planner(task, evaluator=MuJoCo())
+    actions = Actions(jnp.array([[0, NONE]]), jnp.full((1, 2, 3), 0.05))
+    done = planner.execute(task.episode_fn(0), actions)
+    (wanted,) = replay(task, [task.episode_fn(0)], [actions])
+    np.testing.assert_array_equal(done.positions, wanted.positions)
+    assert (done.score, done.status) == (wanted.score, ExecutionStatus.FINE)
+    with pytest.raises(ValueError, match=r"evaluator is MuJoCo.*, no engine in JAX; give another"):
+        planner.plan(task.episode_fn(0), np.array([0]), Reranking(2))

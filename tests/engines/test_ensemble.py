@@ -17,12 +17,12 @@ from jaxsimp.dynamics import (
     make_simulation,
     rollout,
 )
-from jaxsimp.engines import Ensemble, MassSprings, Spread, make_ensemble
+from jaxsimp.engines import Ensemble, Layout, MassSprings, Spread, make_ensemble
 from jaxsimp.engines.ensemble import QUANTITIES, draw_factors
-from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner
+from jaxsimp.planning import CEM, Planner
 from jaxsimp.tasks import Task, make_task
 
-CONFIG = CEMConfig(num_iterations=2, population=6, initial_populations=1)
+ALGORITHM = CEM(num_iterations=2, population=6, initial_populations=1)
 LAYOUT = Layout(chunk_size=3, num_workers=2)
 NO_SPREAD = Spread(**dict.fromkeys(QUANTITIES, 1.0))
 """Every member is the body itself."""
@@ -42,7 +42,11 @@ def ensemble() -> Ensemble:
 
 @lru_cache(None)
 def robust_planner() -> Planner:
-    return Planner(small_task(), CONFIG, LAYOUT, ensemble=ensemble(), judge=MassSprings())
+    return planner_in(ensemble())
+
+
+def planner_in(engine: Ensemble | MassSprings | None = None) -> Planner:
+    return Planner(small_task(), engine, MassSprings(), LAYOUT)
 
 
 jit_rollout = jax.jit(rollout)
@@ -78,16 +82,14 @@ def costs_alone(task: Task, members: Ensemble, index: int) -> np.ndarray:
 def test_an_ensemble_of_the_body_itself_plans_bit_for_bit_as_without():
     task = small_task()
     episode, candidates = task.episode_fn(0), np.array([0, 4, 8])
-    nominal = Planner(task, CONFIG, LAYOUT, judge=MassSprings())
-    members = make_ensemble(task, size=1)
-    one = Planner(task, CONFIG, LAYOUT, ensemble=members, judge=MassSprings())
+    nominal, one = planner_in(), planner_in(make_ensemble(task, size=1))
     np.testing.assert_array_equal(one.costs(episode, plans()), nominal.costs(episode, plans()))
-    found, wanted = (
-        made.plan(episode, candidates, ENCODINGS["categorical"], 3) for made in (one, nominal)
-    )
+    found, wanted = (made.plan(episode, candidates, ALGORITHM, 3) for made in (one, nominal))
     np.testing.assert_array_equal(found.actions.pick, wanted.actions.pick)
     np.testing.assert_array_equal(found.actions.displacement, wanted.actions.displacement)
-    assert dataclasses.astuple(found.search)[1:] == dataclasses.astuple(wanted.search)[1:]
+    for pair in zip(jax.tree.leaves(found.optimum), jax.tree.leaves(wanted.optimum), strict=True):
+        np.testing.assert_array_equal(*pair)
+    assert (found.num_rollouts, found.price) == (wanted.num_rollouts, wanted.price)
 
 
 def test_members_touch_themselves_where_asked_to():
@@ -98,13 +100,13 @@ def test_members_touch_themselves_where_asked_to():
     move[:, 1, 0, 0] -= np.linspace(0.0, 0.1, 6)
     folds = Actions(jnp.asarray(pick), jnp.asarray(move, dtype=float))
 
-    def costs(**physics) -> np.ndarray:
-        return Planner(task, CONFIG, LAYOUT, judge=MassSprings(), **physics).costs(episode, folds)
+    def costs(engine) -> np.ndarray:
+        return Planner(task, engine, MassSprings(), LAYOUT).costs(episode, folds)
 
     touching, passing = (make_ensemble(task, 1, self_contact=touches) for touches in (True, False))
-    found = costs(ensemble=touching)
-    np.testing.assert_array_equal(found, costs(engine=MassSprings(self_contact=True)))
-    assert (np.abs(costs(ensemble=passing) - found) > 0.01 * found).any()
+    found = costs(touching)
+    np.testing.assert_array_equal(found, costs(MassSprings(self_contact=True)))
+    assert (np.abs(costs(passing) - found) > 0.01 * found).any()
 
 
 def test_costs_are_the_mean_of_those_in_each_member_alone():
@@ -122,19 +124,18 @@ def test_costs_are_the_mean_of_those_in_each_member_alone():
 def test_a_robust_plan_is_the_same_every_time_and_lowers_the_robust_cost():
     task = small_task()
     episode, candidates = task.episode_fn(0), np.array([0, 4, 8])
-    first, again = (
-        robust_planner().plan(episode, candidates, ENCODINGS["categorical"], 3) for _ in range(2)
-    )
+    first, again = (robust_planner().plan(episode, candidates, ALGORITHM, 3) for _ in range(2))
     np.testing.assert_array_equal(first.actions.displacement, again.actions.displacement)
-    assert first.search.best_costs == again.search.best_costs
+    np.testing.assert_array_equal(first.optimum.best_costs, again.optimum.best_costs)
     one = jax.tree.map(lambda leaf: leaf[None], first.actions)
     # The cost that the search reports is that of its plan, in the same machine code.
-    assert first.search.cost == robust_planner().costs(episode, one)[0]
+    assert first.optimum.cost == robust_planner().costs(episode, one)[0]
 
 
 COSTS = np.array([[1.0, 3.0, 2.0], [2.0, 2.0, 2.0]])
 
 
+@pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize(
     ("statistic", "caution", "wanted"),
     [
@@ -146,7 +147,8 @@ COSTS = np.array([[1.0, 3.0, 2.0], [2.0, 2.0, 2.0]])
 )
 def test_statistics_of_costs(statistic, caution, wanted):
     made = dataclasses.replace(ensemble(), statistic=statistic, caution=caution)
-    np.testing.assert_allclose(made.cost(COSTS), wanted, rtol=1e-15)
+    found = [float(made.risk(jnp.asarray(costs))) for costs in COSTS]
+    np.testing.assert_allclose(found, wanted, rtol=1e-15)
 
 
 @pytest.mark.parametrize("statistic", ["mean", "worst"])
@@ -154,7 +156,8 @@ def test_statistics_of_costs(statistic, caution, wanted):
 def test_a_plan_that_fails_in_one_member_ranks_last(statistic, bad):
     costs = COSTS.copy()
     costs[1, 2] = bad
-    found = dataclasses.replace(ensemble(), statistic=statistic).cost(costs)
+    made = dataclasses.replace(ensemble(), statistic=statistic)
+    found = [float(made.risk(jnp.asarray(each, dtype=float))) for each in costs]
     assert np.isfinite(found[0])
     assert found[1] == np.inf
 
@@ -165,23 +168,42 @@ def test_a_member_that_is_not_finite_is_counted():
     mass = made.simulations.mass.at[1].set(jnp.nan)
     broken = dataclasses.replace(made, simulations=dataclasses.replace(made.simulations, mass=mass))
     task = small_task()
-    planner = Planner(task, CONFIG, LAYOUT, ensemble=broken, judge=MassSprings())
-    plan = planner.plan(task.episode_fn(0), np.array([0, 8]), ENCODINGS["categorical"], 0)
-    assert plan.search.cost == np.inf
-    assert plan.search.non_finite == 12  # two rounds of six plans
+    plan = planner_in(broken).plan(task.episode_fn(0), np.array([0, 8]), ALGORITHM, 0)
+    assert plan.optimum.cost == np.inf
+    assert plan.optimum.failed == 12  # two rounds of six plans
 
 
-def test_an_ensemble_of_another_engine_is_refused():
-    class Other:
-        def physics(self, task):
-            return ()
+def test_an_ensemble_of_another_body_is_refused():
+    longer = make_task("rope_letter_u", 11)
+    with pytest.raises(ValueError, match=r"of 9 particles and rope_letter_u has 11; make one of"):
+        Planner(longer, ensemble())
 
-        def rollout(self, physics, state, actions, observe):
-            return state, observe(state)
 
-    for engine in (Other(), MassSprings(self_contact=True)):
-        with pytest.raises(ValueError, match="leave one of them out"):
-            Planner(small_task(), CONFIG, LAYOUT, engine, ensemble())
+@pytest.mark.parametrize(("statistic", "caution"), [("worst", 0.0), ("mean", 1.5)])
+def test_costs_are_the_risk_of_those_in_each_member_alone(statistic, caution):
+    each = np.stack([costs_alone(small_task(), ensemble(), e) for e in range(3)], axis=1)
+    made = dataclasses.replace(ensemble(), statistic=statistic, caution=caution)
+    found = planner_in(made).costs(small_task().episode_fn(0), plans())
+    wanted = each.max(axis=1) if statistic == "worst" else each.mean(1) + 1.5 * each.std(1)
+    np.testing.assert_allclose(found, wanted, rtol=1e-4)  # as above
+
+
+def test_a_plan_is_executed_in_the_first_member():
+    task, episode = small_task(), small_task().episode_fn(0)
+    one = jax.tree.map(lambda leaf: leaf[0], plans())
+    done = ensemble().executor(task)(episode, one)
+    factors = dict.fromkeys(QUANTITIES[:-1], 1.0)
+    simulation = make_simulation(
+        scaled_body(task.body, **factors), float(ensemble().simulations.time_step[0])
+    )
+    pickers = make_pickers(task.limits, steps=ensemble().action_steps)
+    _, frames = jit_rollout(simulation, pickers, at_rest(episode.start), one)
+    # metres; float32, other machine code
+    np.testing.assert_allclose(done.positions[1:3], frames, atol=1e-5)
+    # Not as in the second member, by far more than rounding.
+    second = jax.tree.map(lambda leaf: leaf[1], ensemble().simulations)
+    _, others = jit_rollout(second, pickers, at_rest(episode.start), one)
+    assert np.abs(done.positions[1:3] - others).max() > 1e-3
 
 
 # --- members -------------------------------------------------------------------------------------

@@ -22,10 +22,10 @@ from jaxsimp.dynamics import (
     make_simulation,
     rollout,
 )
-from jaxsimp.engines import MassSprings
+from jaxsimp.engines import Layout, MassSprings
 from jaxsimp.engines.mjx import MJX, compare_with_mjx, make_mjx_simulation, mjx_rollout, tendon_spec
 from jaxsimp.engines.mjx import engine as mjx_module
-from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Planner
+from jaxsimp.planning import CEM, Planner
 from jaxsimp.tasks import make_task
 
 # MJX relies on rank promotion.
@@ -154,21 +154,21 @@ def test_a_rollout_on_the_table_is_ours():
 @pytest.mark.slow  # MJX compiles for long
 def test_a_plan_scores_the_same_in_both_engines():
     task, candidates = small_task(), np.array([0, 5, 10])
-    config = CEMConfig(num_iterations=2, population=8, initial_populations=2)
+    algorithm = CEM(num_iterations=2, population=8, initial_populations=2)
     planners = {
-        type(engine): Planner(task, config, Layout(2, 2), engine, judge=engine)
+        type(engine): Planner(task, engine, engine, Layout(2, 2))
         for engine in (MassSprings(), MJX())
     }
-    episode, encoding = task.episode_fn(0), ENCODINGS["categorical"]
-    plans = {kind: p.plan(episode, candidates, encoding, 0) for kind, p in planners.items()}
+    episode = task.episode_fn(0)
+    plans = {kind: p.plan(episode, candidates, algorithm, 0) for kind, p in planners.items()}
     found = plans[MJX]
-    again = planners[MJX].plan(episode, candidates, encoding, 0)
+    again = planners[MJX].plan(episode, candidates, algorithm, 0)
     np.testing.assert_array_equal(again.actions.displacement, found.actions.displacement)
-    assert found.search.non_finite == 0
-    assert found.search.best_costs[-1] <= found.search.best_costs[0]
+    assert found.optimum.failed == 0
+    assert found.optimum.best_costs[-1] <= found.optimum.best_costs[0]
     # Rounding of float32, 1e-7 m, grows at most some hundredfold over 300 time steps: costs and
     # scores are means of distances of 0.1 m.
-    assert found.search.cost == pytest.approx(plans[MassSprings].search.cost, rel=1e-4)
+    assert found.optimum.cost == pytest.approx(plans[MassSprings].optimum.cost, rel=1e-4)
     for plan in plans.values():
         one, other = (p.execute(episode, plan.actions) for p in planners.values())
         assert other.score == pytest.approx(one.score, abs=1e-3)
@@ -182,7 +182,7 @@ def test_a_plan_scores_the_same_in_both_engines():
 def test_a_large_body_is_refused_by_name():
     task = make_task("cloth_side_folding", 25)
     with pytest.raises(ValueError, match=r"the cloth has 625 particles; MJX takes at most \d+"):
-        Planner(task, CEMConfig(), engine=MJX())
+        Planner(task, engine=MJX())
 
 
 def test_an_unstable_time_step_is_refused():
@@ -206,7 +206,8 @@ import jaxsimp.engines
 assert "mujoco" not in sys.modules
 sys.modules["warp"] = None  # what MJX misses, and says so
 from jaxsimp.bodies import rope
-jaxsimp.engines.make_mjx_simulation(rope(3), 1e-3)
+from jaxsimp.engines.mjx import make_mjx_simulation
+make_mjx_simulation(rope(3), 1e-3)
 assert "mujoco.mjx" in sys.modules
 """
 

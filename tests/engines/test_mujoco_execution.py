@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxsimp.dynamics import NONE, Actions
+from jaxsimp.engines import ExecutionStatus, Layout, replay
 from jaxsimp.engines.mujoco import model as flex
-from jaxsimp.engines.mujoco.execution import ReplayStatus, replay
 from jaxsimp.engines.mujoco.model import VARIANTS, Variant
-from jaxsimp.planning import CEMConfig, Layout, Planner
+from jaxsimp.planning import Planner
 from jaxsimp.tasks import make_task, score
 
 
@@ -56,7 +56,7 @@ def test_a_grasped_particle_is_where_its_picker_is_after_each_action(task, varia
     up, over = [0.01, 0.02, 0.06], [-0.02, 0.01, -0.03]
     last = task.body.num_particles - 1
     found = one(task, plan({0: up}, {0: over, last: up}), variant)
-    assert found.status == ReplayStatus.FINE
+    assert found.status == ExecutionStatus.FINE
     assert found.warnings == ()
     path = found.positions[:, [0, last]]
     np.testing.assert_array_equal(path[0], np.asarray(task.episode_fn(0).start)[[0, last]])
@@ -118,7 +118,7 @@ def test_a_dragged_rope_moves_as_ours():
     # drag and stiffness alike.
     task = dataclasses.replace(make_task("rope_folding", 15), num_actions=2, settle_actions=1)
     actions = plan({0: [0.1, 0.14, 0.0]}, {0: [0.1, 0.14, 0.0]})
-    planner = Planner(task, CEMConfig(1, 1, 1), Layout())
+    planner = Planner(task, layout=Layout())
     ours = planner.execute(task.episode_fn(0), actions).positions[-1]
     full = one(task, actions).positions[-1]
     moved = np.linalg.norm(ours - np.asarray(task.episode_fn(0).start), axis=-1)
@@ -153,7 +153,7 @@ def test_an_unstable_simulation_is_a_status(monkeypatch, tmp_path):
     task = small_rope()
     variant = Variant(step, elastic=True, self_collision=False)
     found = one(task, plan({0: [0.05, 0.1, 0.1]}, {0: [0.05, 0.1, 0.1]}), variant)
-    assert found.status == ReplayStatus.UNSTABLE
+    assert found.status == ExecutionStatus.UNSTABLE
     assert np.isnan(found.score)
     assert np.isnan(found.positions[-1]).all()
     assert np.isfinite(found.positions[0]).all()

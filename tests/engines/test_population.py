@@ -7,7 +7,7 @@ import pytest
 
 from jaxsimp.bodies import cloth, rope
 from jaxsimp.dynamics import make_simulation
-from jaxsimp.planning import Layout, PopulationMap, default_layout
+from jaxsimp.engines import Layout, PopulationMap, default_layout, spring_chunk_size
 
 LAYOUTS = [Layout(c, w) for c, w in [(1, 1), (1, 2), (3, 1), (3, 2), (8, 3), (1, 3), (50, 2)]]
 
@@ -133,6 +133,6 @@ def test_a_layout_needs_at_least_one_of_each(chunk_size, num_workers):
 @pytest.mark.parametrize("population", [1, 2, 128, 333])
 @pytest.mark.parametrize("body", [rope(9), cloth((40, 40))], ids=["rope", "large cloth"])
 def test_default_chunks_depend_on_the_body_alone(population, body):
-    layout = default_layout(population, make_simulation(body, 1e-4))
+    layout = default_layout(population, spring_chunk_size(make_simulation(body, 1e-4)))
     assert layout.chunk_size == (1 if body.num_particles > 1000 else min(8, population))
     assert layout.num_workers >= jax.local_device_count()

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsimp.dynamics import NONE
-from jaxsimp.planning import ENCODINGS, ActionSpace, Categorical, GaussianIndex, Joint
+from jaxsimp.planning import ENCODINGS, ActionSpace, Categorical, GaussianIndex, Joint, Plans
 from jaxsimp.planning.encodings import ChoiceAndGaussian, Gaussian
 
 LIMITS = (0.1, 0.2, 0.05)
@@ -25,7 +25,11 @@ def space_of(candidates, num_actions=3, num_pickers=2) -> ActionSpace:
 def drawn(encoding, space, num, key=0, spread=0.7):
     distribution = encoding.init(space, spread)
     sample = encoding.sample(space, distribution, jax.random.key(key), num)
-    return sample, encoding.decode(space, sample)
+    return sample, decoded(encoding, space, sample)
+
+
+def decoded(encoding, space, sample):
+    return space.actions(encoding.decode(space, sample))
 
 
 # --- decoding the Gaussian index ------------------------------------------------------------------
@@ -41,7 +45,7 @@ def test_gaussian_index_is_floored_after_a_linear_map(count):
     middle = (np.arange(count + 1) + 0.5) / (count + 1) * 2 - 1
     sample = np.zeros((count + 1, 1, 1, 4))
     sample[:, 0, 0, 3] = middle
-    actions = GaussianIndex().decode(space, jnp.asarray(sample, dtype=float))
+    actions = decoded(GaussianIndex(), space, jnp.asarray(sample, dtype=float))
     np.testing.assert_array_equal(actions.pick[:, 0, 0], [*candidates, NONE])
 
 
@@ -49,7 +53,7 @@ def test_gaussian_index_is_floored_after_a_linear_map(count):
 def test_gaussian_index_at_the_ends_of_its_range(count):
     space = space_of(np.arange(100, 100 + count), num_actions=1, num_pickers=2)
     ends = jnp.zeros((1, 2, 4)).at[0, :, 3].set(jnp.array([-1.0, 1.0]))
-    picked = GaussianIndex().decode(space, ends).pick
+    picked = decoded(GaussianIndex(), space, ends).pick
     np.testing.assert_array_equal(picked, [[100, NONE]])
 
 
@@ -59,7 +63,7 @@ def test_share_of_none_in_the_range_is_one_in_k_plus_1(count):
     grid = 200 * (count + 1)  # a multiple of K + 1: each choice has exactly 200 points
     sample = np.zeros((grid, 1, 1, 4))
     sample[:, 0, 0, 3] = (np.arange(grid) + 0.5) / grid * 2 - 1
-    picked = np.asarray(GaussianIndex().decode(space, jnp.asarray(sample, dtype=float)).pick)
+    picked = np.asarray(decoded(GaussianIndex(), space, jnp.asarray(sample, dtype=float)).pick)
     # A point next to a boundary may be rounded over it: at most one a side of each choice.
     counts = np.unique(picked, return_counts=True)[1]
     assert len(counts) == count + 1
@@ -71,10 +75,8 @@ def test_first_categorical_draws_are_even(count):
     space = space_of(np.arange(count), num_actions=1, num_pickers=1)
     first = Categorical().init(space, 0.7).frequency
     np.testing.assert_allclose(first, 1 / (count + 1), rtol=1e-6)
-    choice, _ = Categorical().sample(
-        space, Categorical().init(space, 0.7), jax.random.key(0), 20_000
-    )
-    none = np.mean(np.asarray(choice) == count)
+    sample = Categorical().sample(space, Categorical().init(space, 0.7), jax.random.key(0), 20_000)
+    none = np.mean(np.asarray(sample.choice) == count)
     share = 1 / (count + 1)
     # Five deviations of a binomial share.
     assert abs(none - share) < 5 * np.sqrt(share * (1 - share) / 20_000)
@@ -112,7 +114,7 @@ def test_every_candidate_and_none_is_picked_and_every_direction_is_tried(encodin
 def test_one_sample_decodes_as_it_does_in_a_batch(encoding):
     space = space_of([4, 8, 15])
     sample, actions = drawn(encoding, space, 6)
-    one = encoding.decode(space, jax.tree.map(lambda array: array[2], sample))
+    one = decoded(encoding, space, jax.tree.map(lambda array: array[2], sample))
     np.testing.assert_array_equal(one.pick, actions.pick[2])
     np.testing.assert_array_equal(one.displacement, actions.displacement[2])
 
@@ -146,7 +148,7 @@ def test_categorical_update_counts_the_elites():
     choice = rng.integers(0, 5, (9, 3, 2))
     move = rng.uniform(-1, 1, (9, 3, 2, 3)).astype(np.float32)
     before = Categorical().init(space, 0.7)
-    after = Categorical().update(space, before, (jnp.asarray(choice), jnp.asarray(move)), 0.0)
+    after = Categorical().update(space, before, Plans(jnp.asarray(choice), jnp.asarray(move)), 0.0)
     counted = np.stack(
         [[np.bincount(choice[:, t, g], minlength=5) / 9 for g in range(2)] for t in range(3)]
     )
@@ -186,7 +188,7 @@ def test_frequencies_stay_a_distribution():
     space, rng = space_of([5, 6, 7, 8]), np.random.default_rng(2)
     distribution = Categorical().init(space, 0.7)
     for _ in range(30):
-        elites = (
+        elites = Plans(
             jnp.asarray(rng.integers(0, 5, (4, 3, 2))),
             jnp.zeros((4, 3, 2, 3)),
         )
@@ -198,11 +200,11 @@ def test_frequencies_stay_a_distribution():
 
 def test_choices_that_no_elite_made_are_not_drawn_again():
     space = space_of([5, 6, 7, 8])
-    elites = (jnp.full((4, 3, 2), 2), jnp.zeros((4, 3, 2, 3)))
+    elites = Plans(jnp.full((4, 3, 2), 2), jnp.zeros((4, 3, 2, 3)))
     certain = Categorical().update(space, Categorical().init(space, 0.7), elites, 0.0)
-    choice, move = Categorical().sample(space, certain, jax.random.key(0), 200)
-    assert np.all(np.asarray(choice) == 2)
-    assert np.all(np.asarray(move) == 0)  # nor is there any spread left
+    drawn = Categorical().sample(space, certain, jax.random.key(0), 200)
+    assert np.all(np.asarray(drawn.choice) == 2)
+    assert np.all(np.asarray(drawn.direction) == 0)  # nor is there any spread left
 
 
 # --- the mean -------------------------------------------------------------------------------------
@@ -213,7 +215,7 @@ def test_mean_of_a_categorical_is_the_likeliest_choice_with_the_mean_displacemen
     frequency = jnp.array([[[0.1, 0.2, 0.6, 0.1], [0.0, 0.3, 0.2, 0.5]]])
     mean = jnp.arange(6.0).reshape(1, 2, 3) / 10
     distribution = ChoiceAndGaussian(frequency, Gaussian(mean, jnp.ones_like(mean)))
-    actions = Categorical().decode(space, Categorical().mean(space, distribution))
+    actions = decoded(Categorical(), space, Categorical().mean(space, distribution))
     np.testing.assert_array_equal(actions.pick, [[7, NONE]])
     np.testing.assert_allclose(actions.displacement, np.asarray(mean) * LIMITS, rtol=1e-6)
 
@@ -222,7 +224,7 @@ def test_mean_of_a_gaussian_index_is_its_mean():
     space = space_of([5, 6, 7], num_actions=1)
     mean = jnp.array([[[0.1, 0.2, 0.3, -0.9], [0.0, 0.0, -0.5, 0.9]]])
     found = GaussianIndex().mean(space, Gaussian(mean, jnp.ones_like(mean)))
-    actions = GaussianIndex().decode(space, found)
+    actions = decoded(GaussianIndex(), space, found)
     np.testing.assert_array_equal(actions.pick, [[5, NONE]])
     np.testing.assert_allclose(actions.displacement, np.asarray(mean)[..., :3] * LIMITS, rtol=1e-6)
 
@@ -239,14 +241,15 @@ def joint_elites():
     """Three of candidate 5, each moved alike, and one of None, in one slot."""
     choice = jnp.array([0, 0, 0, 2])[:, None, None]
     move = jnp.array([[0.1, 0.2, 0.3]] * 3 + [[-0.9, -0.8, -0.7]])[:, None, None]
-    return choice, move
+    return Plans(choice, move)
 
 
 def test_joint_update_weighs_the_elites_of_a_choice_and_all_elites():
     space = space_of([5, 6], num_actions=1, num_pickers=1)
     encoding = Joint(borrowed=0.5)
-    choice, move = joint_elites()
-    found = encoding.update(space, encoding.init(space, 0.7), (choice, move), 0.0)
+    elites = joint_elites()
+    choice, move = elites.choice, elites.direction
+    found = encoding.update(space, encoding.init(space, 0.7), elites, 0.0)
     np.testing.assert_allclose(found.frequency[0, 0], [0.75, 0.0, 0.25])
     every, moves = np.asarray(move).mean(axis=0)[0, 0], np.asarray(move)[:, 0, 0]
     for option in range(3):
@@ -269,7 +272,7 @@ def test_joint_draws_are_those_of_the_choice_but_for_a_fresh_share():
     )
     count, fresh = 20_000, 0.1
     sample = Joint(fresh=fresh).sample(space, distribution, jax.random.key(0), count)
-    choice, move = (np.asarray(each)[:, 0, 0] for each in sample)
+    choice, move = (np.asarray(each)[:, 0, 0] for each in (sample.choice, sample.direction))
     settled = np.abs(move - np.asarray(mean)[0, 0][choice]).max(axis=1) < 0.01
     # Binomial: five deviations.
     slack = 5 * np.sqrt(fresh * (1 - fresh) / count)
@@ -278,8 +281,8 @@ def test_joint_draws_are_those_of_the_choice_but_for_a_fresh_share():
     anywhere = move[~settled]
     assert np.abs(anywhere.mean(axis=0)).max() < 5 / np.sqrt(3 * len(anywhere))
     assert anywhere.std(axis=0) == pytest.approx(np.sqrt(1 / 3), abs=0.05)
-    settled_alone, _ = Joint(fresh=0.0).sample(space, distribution, jax.random.key(1), 1000)
-    assert set(np.asarray(settled_alone).ravel()) == {0, 1}
+    settled_alone = Joint(fresh=0.0).sample(space, distribution, jax.random.key(1), 1000)
+    assert set(np.asarray(settled_alone.choice).ravel()) == {0, 1}
 
 
 def test_mean_of_a_joint_is_the_likeliest_choice_with_its_own_mean():
@@ -288,6 +291,6 @@ def test_mean_of_a_joint_is_the_likeliest_choice_with_its_own_mean():
     distribution = ChoiceAndGaussian(
         jnp.array([[[0.2, 0.7, 0.1]]]), Gaussian(mean, jnp.ones_like(mean))
     )
-    choice, move = Joint().mean(space, distribution)
-    assert choice.tolist() == [[1]]
-    np.testing.assert_array_equal(move, mean[:, :, 1])
+    found = Joint().mean(space, distribution)
+    assert found.choice.tolist() == [[1]]
+    np.testing.assert_array_equal(found.direction, mean[:, :, 1])

@@ -1,4 +1,4 @@
-"""Plans: the same every time, costed and scored as an independent rollout says, saved whole."""
+"""Plans: the same every time, costed and scored as an independent rollout says."""
 
 import dataclasses
 import os
@@ -7,17 +7,18 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxsimp.dynamics import NONE, Actions, at_rest, make_pickers, rollout, settle
-from jaxsimp.engines import MassSprings
-from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, Plan, Planner, load_plan, save_plan
-from jaxsimp.planning import plan as plan_module
+from jaxsimp.engines import Layout, MassSprings
+from jaxsimp.planning import CEM, ENCODINGS, Plan, Planner, host, problem
+from jaxsimp.records import load_plan, save_plan
 from jaxsimp.tasks import make_task, score
 
-CONFIG = CEMConfig(num_iterations=2, population=6, initial_populations=1)
+ALGORITHM = CEM(num_iterations=2, population=6, initial_populations=1)
 CANDIDATES = np.array([0, 4, 8])
 LAYOUT = Layout(chunk_size=1, num_workers=2)
 
@@ -30,23 +31,24 @@ def small_task():
 
 
 @lru_cache(None)
-def planner(layout: Layout = LAYOUT, returns: str = "best") -> Planner:
+def planner(layout: Layout = LAYOUT) -> Planner:
     # Its pickers are too fast for self-contact.
-    config = dataclasses.replace(CONFIG, returns=returns)
-    return Planner(small_task(), config, layout, judge=MassSprings())
+    return Planner(small_task(), evaluator=MassSprings(), layout=layout)
 
 
-def planned(seed: int = 3, encoding: str = "categorical", *args, **kwargs) -> Plan:
-    task = small_task()
-    return planner(*args, **kwargs).plan(
-        task.episode_fn(seed), CANDIDATES, ENCODINGS[encoding], seed
-    )
+def planned(
+    seed: int = 3, encoding: str = "categorical", layout: Layout = LAYOUT, returns: str = "best"
+) -> Plan:
+    algorithm = dataclasses.replace(ALGORITHM, returns=returns, encoding=ENCODINGS[encoding])
+    return planner(layout).plan(small_task().episode_fn(seed), CANDIDATES, algorithm, seed)
 
 
 def assert_same(first: Plan, second: Plan) -> None:
     np.testing.assert_array_equal(first.actions.pick, second.actions.pick)
     np.testing.assert_array_equal(first.actions.displacement, second.actions.displacement)
-    assert dataclasses.astuple(first.search)[1:] == dataclasses.astuple(second.search)[1:]
+    for pair in zip(jax.tree.leaves(first.optimum), jax.tree.leaves(second.optimum), strict=True):
+        np.testing.assert_array_equal(*pair)
+    assert (first.num_rollouts, first.price) == (second.num_rollouts, second.price)
 
 
 def independent_frames(actions: Actions) -> list[np.ndarray]:
@@ -79,16 +81,17 @@ def test_the_same_seed_gives_the_same_plan_bit_for_bit(encoding):
 
 
 def test_a_planner_made_anew_gives_the_same_plan():
-    anew = Planner(small_task(), CONFIG, LAYOUT, judge=MassSprings())
+    anew = Planner(small_task(), evaluator=MassSprings(), layout=LAYOUT)
     task = small_task()
-    assert_same(anew.plan(task.episode_fn(3), CANDIDATES, ENCODINGS["categorical"], 3), planned(3))
+    assert_same(anew.plan(task.episode_fn(3), CANDIDATES, ALGORITHM, 3), planned(3))
 
 
 IN_A_PROCESS = """
 import dataclasses, sys
 import jax
 import numpy as np
-from jaxsimp.planning import ENCODINGS, CEMConfig, Layout, MassSprings, Planner
+from jaxsimp.engines import Layout, MassSprings
+from jaxsimp.planning import CEM, Planner
 from jaxsimp.tasks import make_task
 path, population, num_devices, layout = sys.argv[1], *map(int, sys.argv[2:4]), sys.argv[4:]
 jax.config.update("jax_num_cpu_devices", num_devices)
@@ -96,18 +99,18 @@ task = dataclasses.replace(
     make_task("rope_folding", 9),
     num_actions=2, action_seconds=0.05, settle_actions=2,
 )
-config = CEMConfig(num_iterations=2, population=population, initial_populations=1)
+algorithm = CEM(num_iterations=2, population=population, initial_populations=1)
 layout = Layout(*map(int, layout)) if layout else None
-planner = Planner(task, config, layout, judge=MassSprings())
+planner = Planner(task, evaluator=MassSprings(), layout=layout)
 assert jax.local_device_count() == num_devices
-assert planner.layout.num_workers >= num_devices
+assert planner.layout_of(algorithm).num_workers >= num_devices
 episode = task.episode_fn(3)
-plan = planner.plan(episode, np.array([0, 4, 8]), ENCODINGS["categorical"], 3)
+plan = planner.plan(episode, np.array([0, 4, 8]), algorithm, 3)
 np.savez(
     path,
     pick=plan.actions.pick,
     displacement=plan.actions.displacement,
-    costs=plan.search.best_costs,
+    costs=plan.optimum.best_costs,
     positions=planner.execute(episode, plan.actions).positions,
 )
 """
@@ -129,7 +132,7 @@ def test_another_process_finds_the_same_plan_bit_for_bit(tmp_path):
     execution = planner().execute(small_task().episode_fn(3), plan.actions)
     np.testing.assert_array_equal(other["pick"], plan.actions.pick)
     np.testing.assert_array_equal(other["displacement"], plan.actions.displacement)
-    np.testing.assert_array_equal(other["costs"], plan.search.best_costs)
+    np.testing.assert_array_equal(other["costs"], plan.optimum.best_costs)
     np.testing.assert_array_equal(other["positions"], execution.positions)
 
 
@@ -146,9 +149,10 @@ def test_layouts_agree_on_the_costs(layout):
     # Other machine code rounds differently. Over 130 time steps of a damped rope a rounding of
     # 1e-7 m grows at most some hundredfold, so costs of a sum of three distances of 0.1 m
     # agree to 1e-4; the two plans are of the same draws as long as no two costs are closer.
-    first, second = planned(3).search, planned(3, "categorical", layout).search
+    first, second = planned(3).optimum, planned(3, "categorical", layout).optimum
     np.testing.assert_allclose(second.best_costs, first.best_costs, rtol=1e-4)
-    np.testing.assert_allclose(second.elite_costs, first.elite_costs, rtol=1e-4)
+    (one,), (other,) = first.traces, second.traces
+    np.testing.assert_allclose(other["elite_costs"], one["elite_costs"], rtol=1e-4)
 
 
 def test_the_number_of_workers_changes_nothing():
@@ -168,7 +172,8 @@ def test_the_cost_of_a_plan_is_that_of_an_independent_rollout(returns):
     steps = [float(task.terminal_cost(episode, at_rest(frame))) for frame in frames[1:-1]]
     assert len(steps) == 3  # two actions, and the state that is left
     # rounding of other machine code, see test_layouts_agree_on_the_costs
-    assert plan.search.cost == pytest.approx(sum(steps), rel=1e-4)
+    assert plan.optimum.cost == pytest.approx(sum(steps), rel=1e-4)
+    assert plan.num_rollouts == plan.price == 12 + (returns == "mean")
 
 
 def test_an_execution_is_that_of_an_independent_rollout():
@@ -190,7 +195,7 @@ def test_a_plan_is_made_of_candidates_within_the_limits():
     assert plan.actions.pick.shape == (2, 2)
     assert set(np.asarray(plan.actions.pick).ravel().tolist()) <= {*CANDIDATES.tolist(), NONE}
     assert np.all(np.abs(plan.actions.displacement) <= np.float32(0.15))
-    assert plan.search.num_rollouts == 12
+    assert plan.num_rollouts == 12
     assert plan.seconds > 0
 
 
@@ -201,28 +206,25 @@ def test_doing_nothing_scores_nothing():
     assert execution.score == pytest.approx(0.0, abs=1e-5)
 
 
-def test_plans_do_not_compile_again():
+def test_plans_do_not_compile_again(monkeypatch):
     # Another seed, and as many candidates: nothing is traced anew.
-    planned(3)
-    traces = []
+    traces, original = [], problem.plan_cost
 
     def counted(*arguments):
         traces.append(None)
         return original(*arguments)
 
-    original, plan_module._plan_cost = plan_module._plan_cost, counted
-    try:
-        fresh = Planner(small_task(), CONFIG, LAYOUT, judge=MassSprings())
-        compiled = len(traces)
-        for seed in (1, 2):
-            fresh.plan(
-                small_task().episode_fn(seed), CANDIDATES + 0, ENCODINGS["categorical"], seed
-            )
-        fresh.estimate_seconds()
-    finally:
-        plan_module._plan_cost = original
+    monkeypatch.setattr(problem, "plan_cost", counted)
+    fresh = Planner(small_task(), evaluator=MassSprings(), layout=LAYOUT)
+    planned(3)  # of another planner: the exchanges of the algorithm are compiled
+    fresh.prepare(ALGORITHM)
+    compiled, exchanges = len(traces), host._compile.cache_info().misses
+    for seed in (1, 2):
+        fresh.plan(small_task().episode_fn(seed), CANDIDATES + seed - 1, ALGORITHM, seed)
+    fresh.estimate_seconds(ALGORITHM)
     assert compiled > 0
     assert len(traces) == compiled
+    assert host._compile.cache_info().misses == exchanges
 
 
 def test_float64_plans(x64):
@@ -232,14 +234,11 @@ def test_float64_plans(x64):
         action_seconds=0.02,
         settle_actions=1,
     )
-    config = CEMConfig(num_iterations=1, population=2, initial_populations=1)
-    made = Planner(task, config, Layout(1, 1), judge=MassSprings())
-    plan = made.plan(task.episode_fn(0), np.array([0]), ENCODINGS["categorical"], 0)
+    algorithm = CEM(num_iterations=1, population=2, initial_populations=1)
+    made = Planner(task, evaluator=MassSprings(), layout=Layout(1, 1))
+    plan = made.plan(task.episode_fn(0), np.array([0]), algorithm, 0)
     assert plan.actions.displacement.dtype == np.float64
     assert made.execute(task.episode_fn(0), plan.actions).positions.dtype == np.float64
-
-
-# --- saved plans ---------------------------------------------------------------------------------
 
 
 def test_a_loaded_plan_replays_bit_for_bit(tmp_path):
@@ -255,62 +254,3 @@ def test_a_loaded_plan_replays_bit_for_bit(tmp_path):
     replay = planner().execute(episode, actions)
     np.testing.assert_array_equal(replay.positions, arrays["positions"])
     assert replay.score == execution.score
-
-
-def some_plan() -> tuple[Actions, np.ndarray]:
-    actions = Actions(jnp.zeros((2, 2), dtype=int), jnp.zeros((2, 2, 3)))
-    return actions, np.zeros((4, 9, 3), np.float32)
-
-
-def test_a_save_that_fails_leaves_the_old_plan(tmp_path, monkeypatch):
-    path = tmp_path / "plan.npz"
-    save_plan(path, *some_plan())
-    before = path.read_bytes()
-
-    def full(file, **arrays):
-        file.write(b"half of a pl")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", full)
-    for name in ("plan.npz", "new.npz"):
-        with pytest.raises(OSError, match="no space"):
-            save_plan(tmp_path / name, *some_plan())
-    assert path.read_bytes() == before
-    assert not (tmp_path / "new.npz").exists()
-
-
-def broken_files() -> dict[str, bytes]:
-    import io
-
-    other, single = io.BytesIO(), io.BytesIO()
-    np.savez(other, pick=np.zeros((1, 2), int))
-    np.save(single, np.zeros(3))
-    return {
-        "garbage": b"not a plan at all",
-        "nothing": b"",
-        "another archive": other.getvalue(),
-        "one array": single.getvalue(),
-    }
-
-
-@pytest.mark.parametrize("content", broken_files().values(), ids=broken_files())
-def test_a_file_that_is_no_plan_is_refused_by_name(tmp_path, content):
-    path = tmp_path / "plan.npz"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"plan\.npz .*not a saved plan"):
-        load_plan(path)
-
-
-@pytest.mark.parametrize("share", [0.3, 0.9])
-def test_a_plan_cut_short_is_refused_by_name(tmp_path, share):
-    path = tmp_path / "plan.npz"
-    save_plan(path, *some_plan())
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ValueError, match=r"plan\.npz .*not a saved plan"):
-        load_plan(path)
-
-
-def test_a_plan_that_is_not_there(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"plan\.npz"):
-        load_plan(tmp_path / "plan.npz")
