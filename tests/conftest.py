@@ -45,6 +45,16 @@ settings.register_profile(
 settings.load_profile("house")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """With workers: each takes its share in order, and from the others when it has done it.
+
+    Tests of a file stay together, and with them what they share; both work to the end.
+    """
+    if getattr(config.option, "numprocesses", None) and config.option.dist == "no":
+        config.option.dist = "worksteal"
+
+
 @pytest.fixture
 def x64() -> Iterator[None]:
     """Float64 for the length of the test: for oracles, gradients and convergence orders."""
@@ -70,6 +80,18 @@ def unchecked_shapes() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", before)
+
+
+@pytest.fixture(scope="module")
+def compiled_quickly() -> Iterator[None]:
+    """Little optimisation: where code runs for a millisecond, and it is not its speed that counts.
+
+    The same operations are compiled, in less time; what they give differs by rounding.
+    """
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture(scope="session")

@@ -5,10 +5,9 @@ import json
 import sys
 from pathlib import Path
 
-import jax
-import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from experiments.benchmark import __main__ as command
 from experiments.benchmark import checks, rollouts
@@ -43,6 +42,9 @@ TINY = dataclasses.replace(
     goals=(3,),
 )
 
+# Most of the time here is compilation of code that then runs for a millisecond.
+pytestmark = pytest.mark.usefixtures("compiled_quickly")
+
 
 def run(*options: object) -> int:
     """What `python -m experiments.benchmark` does, without another process."""
@@ -56,15 +58,6 @@ def only(*names: str) -> list[str]:
     return [word for name in names for word in ("--only", name)]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_quickly():
-    """Most of the time here is compilation of code that then runs for a millisecond."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
 @pytest.fixture(scope="module")
 def without_peers():
     """The engines that need no compiler of their own: the others take seconds to start."""
@@ -74,21 +67,32 @@ def without_peers():
         yield
 
 
-def measure(folder, *names: str) -> tuple[tuple[str, ...], Path]:
-    """A tiny run of some sections: their names, and where its results are."""
-    options = ("--json", folder / "rows.json", "--figures", folder / "figures")
-    assert run("--quick", *only(*names), *options) == 0
-    return names, folder
+Results = tuple[tuple[str, ...], Path, dict[str, Figure]]
+"""Names of sections, where their results are, and their figures."""
 
 
 @pytest.fixture(scope="module")
-def results(without_peers, tmp_path_factory):
-    return measure(tmp_path_factory.mktemp("results"), "rollout", "engines", "line_fit")
+def measure(without_peers, compiled_quickly, tmp_path_factory, figures_saved):
+    """A tiny run of some sections."""
+
+    def measured(*names: str) -> Results:
+        folder = tmp_path_factory.mktemp("results")
+        options = ("--json", folder / "rows.json", "--figures", folder / "figures")
+        with figures_saved() as figures:
+            assert run("--quick", *only(*names), *options) == 0
+        return names, folder, figures
+
+    return measured
 
 
 @pytest.fixture(scope="module")
-def slow_results(without_peers, tmp_path_factory):
-    return measure(tmp_path_factory.mktemp("results"), "population", "cem", "scaling")
+def results(measure):
+    return measure("rollout", "engines", "line_fit")
+
+
+@pytest.fixture(scope="module")
+def slow_results(measure):
+    return measure("population", "cem", "scaling")
 
 
 # --- rows -----------------------------------------------------------------------------------------
@@ -98,7 +102,7 @@ def slow_results(without_peers, tmp_path_factory):
     "fixture", ["results", pytest.param("slow_results", marks=pytest.mark.slow)]
 )
 def test_rows_have_their_columns(fixture, request):
-    names, folder = request.getfixturevalue(fixture)
+    names, folder, _ = request.getfixturevalue(fixture)
     written = json.loads((folder / "rows.json").read_text())
     assert written.keys() == {"environment", "rows"}
     assert written["environment"]["versions"]["jax"]
@@ -169,18 +173,36 @@ def of_section(results, name):
     return [row for row in rows if row["section"] == name]
 
 
-@pytest.mark.parametrize(
-    ("fixture", "names"),
-    [
-        ("results", ["engines.png"]),
-        pytest.param("slow_results", ["population.png", "scaling.png"], marks=pytest.mark.slow),
-    ],
-)
-def test_figures_are_drawn(fixture, names, request):
-    folder = request.getfixturevalue(fixture)[1] / "figures"
-    assert sorted(path.name for path in folder.iterdir()) == names
-    for path in folder.iterdir():
-        assert matplotlib.image.imread(path)[..., :3].std() > 0.02
+def written(results) -> list[str]:
+    return sorted(path.name for path in (results[1] / "figures").iterdir())
+
+
+def test_engines_are_drawn_as_bars_of_their_speed(results):
+    assert written(results) == ["engines.png"]
+    (axes,) = results[2]["engines.png"].axes
+    rows = [row for row in of_section(results, "engines") if row["run_seconds"]]
+    rows.sort(key=lambda row: row["particle_steps_per_second"])
+    speeds = [bar.get_width() for bar in axes.patches]
+    assert speeds == pytest.approx([row["particle_steps_per_second"] / 1e6 for row in rows])
+    assert "1 ×" in [text.get_text().strip() for text in axes.texts]
+    names = [label.get_text().split("\n")[0] for label in axes.get_yticklabels()]
+    assert names == [row["engine"].replace("_", " ") for row in rows]
+
+
+@pytest.mark.slow
+def test_layouts_and_sweeps_are_drawn_as_lines(slow_results):
+    assert written(slow_results) == ["population.png", "scaling.png"]
+    (layouts,), (scaling,) = (slow_results[2][name].axes for name in written(slow_results))
+    rows = of_section(slow_results, "population")
+    drawn = sorted(speed for line in layouts.lines for speed in line.get_ydata())
+    wanted = sorted(row["particle_steps_per_second"] / 1e6 for row in rows)
+    assert drawn == pytest.approx(wanted)
+    rows = of_section(slow_results, "scaling")
+    assert len(scaling.lines) == 3
+    for line, sweep in zip(scaling.lines, (rows[0:2], rows[2:4], rows[4:6]), strict=True):
+        assert list(line.get_xdata()) == [row["particle_steps"] for row in sweep]
+        assert list(line.get_ydata()) == [row["run_seconds"] for row in sweep]
+        assert f"exponent {sweep[0]['exponent']:.2f}" in line.get_label()
 
 
 def test_no_figure_is_drawn_of_what_was_not_timed(tmp_path):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import plan_report, plans, run
+from experiments import plan_options, plan_report, plans, run
 from jaxsimp.planning import CEM, ENCODINGS
 from jaxsimp.records import load_plan
 from jaxsimp.tasks import make_task, score
@@ -107,16 +107,16 @@ def test_plans_load_and_end_in_the_score_of_their_run(folder):
     summary = finished(folder)
     key_points = {model["task"]: model["key_points"] for model in summary["models"]}
     for row in summary["runs"]:
-        actions, arrays = load_plan(folder / row["plan"])
+        plan = load_plan(folder / row["plan"])
         task = make_task(row["task"], 9)
-        assert arrays["positions"].shape == (3, task.body.num_particles, 3)
-        last = np.asarray(arrays["positions"][-1], np.float32)
+        assert plan.positions.shape == (3, task.body.num_particles, 3)
+        last = np.asarray(plan.positions[-1], np.float32)
         episode = task.episode_fn(row["seed"])
         found = score(task, episode, jnp.asarray(last))
         # float32, compiled with other code around it
         assert row["final_score"] == pytest.approx(float(found), abs=1e-5)
         if row["action_space"] == "key_points":
-            picked = set(np.asarray(actions.pick).ravel().tolist())
+            picked = set(np.asarray(plan.actions.pick).ravel().tolist())
             assert picked <= {*key_points[row["task"]], -1}
 
 
@@ -208,7 +208,9 @@ def test_a_study_cut_short_in_a_row_goes_on_to_the_same_runs(folder, tmp_path):
 @pytest.mark.slow
 def test_a_killed_process_goes_on_to_the_same_runs(folder, tmp_path):
     out, rows = tmp_path / "killed", tmp_path / "killed" / "runs.jsonl"
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    # A copy of what is compiled: a file that the kill cuts short must not be read by others.
+    programs = shutil.copytree(os.environ["JAX_COMPILATION_CACHE_DIR"], tmp_path / "programs")
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "JAX_COMPILATION_CACHE_DIR": str(programs)}
     with subprocess.Popen(
         [sys.executable, "-m", "experiments.run", *OPTIONS, "--out", out],
         cwd=ROOT,
@@ -231,7 +233,7 @@ def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch,
     def interrupt(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(run, "run_study", interrupt)
+    monkeypatch.setattr(plan_options, "run_study", interrupt)
     assert command(*OPTIONS, "--out", tmp_path / "new") == 130
     assert "goes on" in capsys.readouterr().out
 
@@ -253,8 +255,8 @@ def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch,
         (("--elite-fraction", "2"), "elite_fraction is 2.0; give"),
         (("--smoothing", "1"), "smoothing is 1.0; give"),
         (("--initial-spread", "nan"), "initial_spread is nan; give"),
-        (("--resolution", "3"), "resolution is 3; a task needs at least 5"),
-        (("--resolution", "0"), "resolution is 0; a task needs at least 5"),
+        (("--resolution", "3"), "resolution is 3; a task needs a whole number"),
+        (("--resolution", "0"), "resolution is 0; a task needs a whole number"),
         (("--tasks", "rope_folding", "rope_folding"), "task 'rope_folding' is given twice"),
         (("--pick-encodings", "categorical", "categorical"), "'categorical' is given twice"),
     ],

@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import run
+from experiments import run, transfer
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
-from jaxsimp.engines import Layout, MassSprings, make_ensemble
+from jaxsimp.engines import Execution, MassSprings, make_ensemble
+from jaxsimp.engines.mujoco.model import VARIANTS
 from jaxsimp.planning import Planner
-from jaxsimp.records import load_plan, read_rows
+from jaxsimp.records import load_plan, read_rows, save_plan
 from jaxsimp.tasks import make_task, score, task_names
 
 TASKS = ("rope_straightening", "cloth_diagonal_folding")
@@ -81,7 +82,7 @@ def test_scores_are_those_of_the_settled_positions(folder, variant):
             (folder / row["plan"], row["final_score"]),
             (replay_path(folder, row, variant), row[f"mujoco_{variant}_score"]),
         ):
-            last = load_plan(path)[1]["positions"][-1]
+            last = load_plan(path).positions[-1]
             expected = float(score(task, episode, jnp.asarray(last, dtype=float)))
             assert found == pytest.approx(expected, abs=1e-5)  # float32, compiled otherwise
 
@@ -149,18 +150,18 @@ def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
 
 @pytest.mark.slow
 def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
-    options = (*OPTIONS, "--tasks", "rope_straightening", "--planning", "robust")
+    options = (*OPTIONS, "--tasks", "rope_folding", "--planning", "robust")
     out = tmp_path / "robust"
     assert command(*options, "--out", out) == 0
     (row,), (by_hand,) = finished(out)["transfer"], finished(out)["scripted"]
     assert (row["planning"], by_hand["planning"]) == ("robust", "scripted")
-    assert "| rope_straightening | key points | robust |" in (out / "report.md").read_text()
+    assert "| rope_folding | key points | robust |" in (out / "report.md").read_text()
     # The search's cost of the plan is the one of the ensemble, not that of the body's own physics.
-    task = make_task("rope_straightening", 7)
+    task = make_task("rope_folding", 7)
     task = dataclasses.replace(task, num_actions=1)
-    plan = jax.tree.map(lambda array: array[None], load_plan(out / row["plan"])[0])
+    plan = jax.tree.map(lambda array: array[None], load_plan(out / row["plan"]).actions)
     robust, nominal = (
-        Planner(task, engine, layout=Layout()).costs(task.episode_fn(0), plan)[0]
+        Planner(task, engine).costs(task.episode_fn(0), plan)[0]
         for engine in (make_ensemble(task, 4), MassSprings())
     )
     (found,) = read_rows(out / "runs.jsonl")
@@ -196,11 +197,26 @@ def test_plans_with_self_contact_are_those_of_its_physics(tmp_path):
     (found,) = read_rows(out / "runs.jsonl")
     assert row["planning"] == "self_contact"
     task = dataclasses.replace(make_task("rope_folding", 7), num_actions=1)
-    plan = load_plan(out / row["plan"])[0]
-    planner = Planner(task, MassSprings(self_contact=True), layout=Layout())
-    execution = planner.execute(task.episode_fn(0), plan)
+    plan = load_plan(out / row["plan"]).actions
+    execution = MassSprings(self_contact=True).executor(task)(task.episode_fn(0), plan)
     assert execution.missed is not None
     assert found["final_score"] == pytest.approx(execution.score, abs=1e-5)  # float32
+
+
+@pytest.mark.slow
+def test_a_plan_is_replayed_from_the_start_that_it_was_made_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(transfer, "VARIANTS", {"fast": VARIANTS["fast"]})
+    (tmp_path / transfer.REPLAYS_FOLDER).mkdir()
+    task, seed = make_task("cloth_side_folding", 5), 3
+    episode = task.episode_fn(seed)
+    plan, path = scripted_plan(task, episode), tmp_path / "plan.npz"
+    nothing = Execution(np.zeros((task.num_actions + 2, 25, 3)), 0.0)
+    save_plan(path, task, episode, plan, nothing, engine=MassSprings())
+    row = {"task": task.name, "action_space": "scripted", "seed": seed, "plan": path.name}
+    (done,) = transfer._replay_task(task, [transfer.Case(row, path)], tmp_path)
+    assert done["mujoco_fast_status"] == "FINE"
+    frames = load_plan(replay_path(tmp_path, row, "fast")).positions
+    np.testing.assert_allclose(frames[0], task.episode_fn(seed).start, atol=1e-7)  # float32
 
 
 def test_robust_is_refused_for_plans_that_are_found(tmp_path, capsys):

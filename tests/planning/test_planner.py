@@ -1,6 +1,7 @@
 """Plans: the same every time, costed and scored as an independent rollout says."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 from functools import lru_cache
@@ -118,7 +119,9 @@ np.savez(
 def in_another_process(path: Path, *arguments: int) -> dict[str, np.ndarray]:
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", IN_A_PROCESS, path, *map(str, arguments)]
-    subprocess.run(command, check=True, cwd=root)
+    # It compiles for itself: that gives the same code, too.
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    subprocess.run(command, check=True, cwd=root, env=environment)
     with np.load(path) as found:
         return dict(found)
 
@@ -133,11 +136,10 @@ def test_another_process_finds_the_same_plan_bit_for_bit(tmp_path):
     np.testing.assert_array_equal(other["positions"], execution.positions)
 
 
-@pytest.mark.parametrize("num_devices", [2, 4, 8])
-def test_any_number_of_devices_finds_the_same_plan_bit_for_bit(num_devices, tmp_path):
-    # By the default layout: each of the devices has a share of 64 plans.
+def test_any_number_of_devices_finds_the_same_plan_bit_for_bit(tmp_path):
+    # By the default layout: each has a share of 64 plans, which 3 devices cannot share evenly.
     one = in_another_process(tmp_path / "one.npz", 64, 1)
-    more = in_another_process(tmp_path / "more.npz", 64, num_devices)
+    more = in_another_process(tmp_path / "more.npz", 64, 3)
     for name, array in one.items():
         np.testing.assert_array_equal(more[name], array)
 
