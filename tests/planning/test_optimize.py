@@ -57,7 +57,7 @@ class Quadratic:
             first = actions.pick[0, 0]
             cost = jnp.where(first == 11, jnp.nan, cost)
             # The root of zero has a slope that is not finite.
-            cost = cost + jnp.where(first == 42, jnp.sqrt(0.0 * off.sum()), 0.0)
+            cost = cost + jnp.sqrt(jnp.where(first == 42, 0.0 * off.sum(), 1.0))
         return cost
 
     def settled_cost(self, actions: Actions) -> Array:
@@ -174,7 +174,7 @@ def test_vmap_over_keys_and_over_episodes_is_one_search_each():
         return dataclasses.replace(quadratic(), move=move)
 
     keys = jax.random.split(jax.random.key(0), 4)
-    moves = jnp.asarray(MOVE) + jnp.arange(4.0)[:, None, None, None] / 10
+    moves = jnp.asarray(MOVE + np.arange(4.0).reshape(4, 1, 1, 1) / 10)
     for axes, arguments in (((None, 0), (moves[0], keys)), ((0, None), (moves, keys[0]))):
         together = jax.jit(jax.vmap(run, in_axes=axes))(*arguments)
         for index in range(4):
@@ -204,6 +204,9 @@ class Probe(RandomShooting):
             "costs": zeros[:, 0, 0, 0],
             "gradients": zeros,
         }
+
+    def ask(self, space, state, key):
+        return state, super().ask(space, (), key)[1]
 
     def tell(self, space, state, plans, told):
         gradients = state["gradients"] if told.gradients is None else told.gradients
