@@ -286,9 +286,18 @@ def test_reranking_returns_what_settles_best_of_the_best_plans():
     np.testing.assert_array_equal(found.actions.displacement, plans.displacement[settled.argmin()])
     alone = on_host(quadratic(), SHORT, 0)
     np.testing.assert_array_equal(plans.displacement[0], alone.actions.displacement)
-    # Its cost is a cost, not the number that it was chosen by.
+    # Costs are costs, not the numbers that it was chosen by: its own, and those of the archive.
+    archived = jax.vmap(quadratic().cost)(quadratic().space.actions(found.archive.plans))
+    np.testing.assert_allclose(found.archive.costs, archived, rtol=1e-6)  # float32
     assert found.cost == pytest.approx(float(quadratic().cost(found.actions)), rel=1e-6)
     assert found.cost >= alone.cost
+
+
+def test_algorithms_of_a_sequence_draw_by_themselves():
+    asked, shots = [], RandomShooting(num_asks=1, num_plans=4)
+    on_host(quadratic(), Sequence((shots, shots)), 0, asked)
+    (_, first, _), (_, second, _) = asked
+    assert np.all(first.displacement != second.displacement)
 
 
 def test_a_second_search_keeps_the_best_of_the_first_among_its_elites():
