@@ -80,7 +80,7 @@ def search_on_host(
             progress, recorded = exchanges.absorb(space, progress, plans, told)
             records.append(recorded)
             on_ask()
-        recorded = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *records)
+        recorded = jax.tree.map(lambda *leaves: np.stack(leaves), *records)
         return progress, exchanges.finish(space, progress), recorded
 
     def cost_of_one(actions: Actions) -> Told:

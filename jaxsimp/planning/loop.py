@@ -4,13 +4,14 @@
 episodes. `Planner` runs the same `search`, the exchanges of each stage in a loop on the host.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
 from jaxsimp.dynamics import Actions
@@ -60,7 +61,7 @@ class Optimum:
     cost: Float[Array, "*E"]
     archive: Archive
     best_costs: Float[Array, "*E asks"]
-    traces: tuple[dict[str, Array], ...]
+    traces: tuple[Mapping[str, Array | np.ndarray], ...]
     failed: Int[Array, "*E"]
 
 
@@ -71,7 +72,7 @@ RunStage = Callable[
 ]
 """Runs one algorithm from an archive and a count of failures, an exchange for each key: the
 progress after the last, the actions that it returns, and a record."""
-Recorded = tuple[Float[Array, "*asks"], dict[str, Array]]
+Recorded = tuple[Float[Array | np.ndarray, "*asks"], Mapping[str, Array | np.ndarray]]
 """Lowest cost so far, and what `Algorithm.trace` gave, after one exchange or after each."""
 
 

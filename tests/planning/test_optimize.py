@@ -57,13 +57,12 @@ class Quadratic:
             first = actions.pick[0, 0]
             cost = jnp.where(first == 11, jnp.nan, cost)
             # The root of zero has a slope that is not finite.
-            cost = cost + jnp.where(first == 42, jnp.sqrt(0.0 * off.sum()), 0.0)
+            cost = cost + jnp.sqrt(jnp.where(first == 42, 0.0 * off.sum(), 1.0))
         return cost
 
     def settled_cost(self, actions: Actions) -> Array:
-        return jnp.abs(
-            actions.displacement[..., 0] / self.space.limits[0] - self.move[..., 0]
-        ).sum()
+        off = actions.displacement[..., 0] / self.space.limits[0] - self.move[..., 0]
+        return 0.01 * jnp.abs(off).sum()  # below all costs
 
 
 def quadratic(shift: float = 0.0, **options) -> Quadratic:
@@ -174,7 +173,7 @@ def test_vmap_over_keys_and_over_episodes_is_one_search_each():
         return dataclasses.replace(quadratic(), move=move)
 
     keys = jax.random.split(jax.random.key(0), 4)
-    moves = jnp.asarray(MOVE) + jnp.arange(4.0)[:, None, None, None] / 10
+    moves = jnp.asarray(MOVE + np.arange(4.0).reshape(4, 1, 1, 1) / 10)
     for axes, arguments in (((None, 0), (moves[0], keys)), ((0, None), (moves, keys[0]))):
         together = jax.jit(jax.vmap(run, in_axes=axes))(*arguments)
         for index in range(4):
@@ -204,6 +203,9 @@ class Probe(RandomShooting):
             "costs": zeros[:, 0, 0, 0],
             "gradients": zeros,
         }
+
+    def ask(self, space, state, key):
+        return state, super().ask(space, (), key)[1]
 
     def tell(self, space, state, plans, told):
         gradients = state["gradients"] if told.gradients is None else told.gradients
@@ -283,9 +285,18 @@ def test_reranking_returns_what_settles_best_of_the_best_plans():
     np.testing.assert_array_equal(found.actions.displacement, plans.displacement[settled.argmin()])
     alone = on_host(quadratic(), SHORT, 0)
     np.testing.assert_array_equal(plans.displacement[0], alone.actions.displacement)
-    # Its cost is a cost, not the number that it was chosen by.
+    # Costs are costs, not the numbers that it was chosen by: its own, and those of the archive.
+    archived = jax.vmap(quadratic().cost)(quadratic().space.actions(found.archive.plans))
+    np.testing.assert_allclose(found.archive.costs, archived, rtol=1e-6)  # float32
     assert found.cost == pytest.approx(float(quadratic().cost(found.actions)), rel=1e-6)
     assert found.cost >= alone.cost
+
+
+def test_algorithms_of_a_sequence_draw_by_themselves():
+    asked, shots = [], RandomShooting(num_asks=1, num_plans=4)
+    on_host(quadratic(), Sequence((shots, shots)), 0, asked)
+    (_, first, _), (_, second, _) = asked
+    assert np.all(first.displacement != second.displacement)
 
 
 def test_a_second_search_keeps_the_best_of_the_first_among_its_elites():

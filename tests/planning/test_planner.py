@@ -14,11 +14,25 @@ import pytest
 
 from jaxsimp.dynamics import NONE, Actions, at_rest, make_pickers, rollout, settle
 from jaxsimp.engines import Layout, MassSprings
-from jaxsimp.planning import CEM, ENCODINGS, Plan, Planner, host, problem
+from jaxsimp.planning import (
+    CEM,
+    ENCODINGS,
+    Descent,
+    Plan,
+    Planner,
+    Reranking,
+    Sequence,
+    host,
+    make_problem,
+    optimize,
+    price,
+    problem,
+)
 from jaxsimp.records import load_plan, save_plan
 from jaxsimp.tasks import make_task, score
 
 ALGORITHM = CEM(num_iterations=2, population=6, initial_populations=1)
+SEQUENCE = Sequence((ALGORITHM, Descent(num_asks=2, num_starts=2), Reranking(num_starts=2)))
 CANDIDATES = np.array([0, 4, 8])
 LAYOUT = Layout(chunk_size=1, num_workers=2)
 
@@ -216,15 +230,37 @@ def test_plans_do_not_compile_again(monkeypatch):
 
     monkeypatch.setattr(problem, "plan_cost", counted)
     fresh = Planner(small_task(), evaluator=MassSprings(), layout=LAYOUT)
-    planned(3)  # of another planner: the exchanges of the algorithm are compiled
-    fresh.prepare(ALGORITHM)
+    fresh.plan(small_task().episode_fn(0), CANDIDATES, ALGORITHM)
     compiled, exchanges = len(traces), host._compile.cache_info().misses
     for seed in (1, 2):
-        fresh.plan(small_task().episode_fn(seed), CANDIDATES + seed - 1, ALGORITHM, seed)
+        fresh.plan(small_task().episode_fn(seed), CANDIDATES // seed, ALGORITHM, seed)
     fresh.estimate_seconds(ALGORITHM)
     assert compiled > 0
     assert len(traces) == compiled
     assert host._compile.cache_info().misses == exchanges
+
+
+def test_what_a_sequence_costs_adds_up_and_is_compiled_once(monkeypatch):
+    made, episode = planner(), small_task().episode_fn(3)
+    plan = made.plan(episode, CANDIDATES, SEQUENCE, 3)
+    # Six plans twice; two descend twice; two settle; and the cost of the one that is returned.
+    assert plan.num_rollouts == 12 + 4 + 2 + 1
+    assert plan.price == 12 + 6 * 4 + 4 * 2 + 1 == price(SEQUENCE) + 1
+    assert len(plan.optimum.best_costs) == 2 + 2 + 1
+    one = jax.tree.map(lambda leaf: leaf[None], plan.actions)
+    # The same plan in the same machine code.
+    assert plan.optimum.cost == made.costs(episode, one)[0]
+    exchanges = host._compile.cache_info().misses
+    monkeypatch.setattr(problem, "plan_cost", None)  # what is traced fails
+    monkeypatch.setattr(problem, "settled_score", None)
+    assert_same(made.plan(episode, CANDIDATES, SEQUENCE, 3), plan)
+    assert host._compile.cache_info().misses == exchanges
+
+
+def test_settled_scores_need_an_evaluator():
+    alone = make_problem(small_task(), CANDIDATES)
+    with pytest.raises(ValueError, match=r"problem has no evaluator; give `make_problem` one"):
+        optimize(alone, Reranking(2), jax.random.key(0))
 
 
 def test_float64_plans(x64):
