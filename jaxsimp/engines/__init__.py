@@ -13,7 +13,7 @@ from jaxsimp.engines.ensemble import Ensemble, Spread, make_ensemble
 from jaxsimp.engines.mjx import MJX, compare_with_mjx
 from jaxsimp.engines.mujoco import MuJoCo, replay
 from jaxsimp.engines.population import Layout, PopulationMap, default_layout
-from jaxsimp.engines.rollouts import plan_cost, settled_score
+from jaxsimp.engines.rollouts import RolloutExecutor, plan_cost, settled_score
 from jaxsimp.engines.springs import MassSprings, spring_chunk_size
 
 __all__ = [
@@ -28,6 +28,7 @@ __all__ = [
     "MuJoCo",
     "Observe",
     "PopulationMap",
+    "RolloutExecutor",
     "SearchEngine",
     "Spread",
     "compare_with_mjx",

@@ -17,16 +17,18 @@ from jaxsimp.tasks import Episode, Task, score
 def plan_cost(
     task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
 ) -> Float[Array, ""]:
-    """Cost of a plan: the sum of the running costs over its actions (paper, section IV-A).
+    """Cost of a plan: the running costs of its actions and the terminal cost, added up.
 
-    The state that is left when the pickers have let go counts as one more step.
+    The terminal cost is of the state that is left an action's time after the pickers have let go.
+    The paper adds up the same cost over all steps (section IV-A).
     """
 
-    def running_cost(state: State, action: Actions) -> Float[Array, ""]:
-        return task.running_cost(episode, state, action)
+    def both_costs(state: State, action: Actions) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        return task.running_cost(episode, state, action), task.terminal_cost(episode, state)
 
     start = at_rest(episode.start)
-    _, costs = engine.rollout(physics, start, then_idle(actions, 1), running_cost)
+    _, (running, terminal) = engine.rollout(physics, start, then_idle(actions, 1), both_costs)
+    costs = jnp.concatenate([running[..., :-1], terminal[..., -1:]], axis=-1)
     return engine.risk(costs.sum(axis=-1))
 
 

@@ -194,7 +194,7 @@ def test_a_plan_is_executed_in_the_first_member():
     done = ensemble().executor(task)(episode, one)
     factors = dict.fromkeys(QUANTITIES[:-1], 1.0)
     simulation = make_simulation(
-        scaled_body(task.body, **factors), float(ensemble().simulations.time_step[0])
+        task.body.scaled(**factors), float(ensemble().simulations.time_step[0])
     )
     pickers = make_pickers(task.limits, steps=ensemble().action_steps)
     _, frames = jit_rollout(simulation, pickers, at_rest(episode.start), one)

@@ -168,7 +168,7 @@ def test_a_plan_scores_the_same_in_both_engines():
     assert found.optimum.best_costs[-1] <= found.optimum.best_costs[0]
     # Rounding of float32, 1e-7 m, grows at most some hundredfold over 300 time steps: costs and
     # scores are means of distances of 0.1 m.
-    assert found.optimum.cost == pytest.approx(plans[MassSprings].optimum.cost, rel=1e-4)
+    assert found.optimum.cost == pytest.approx(float(plans[MassSprings].optimum.cost), rel=1e-4)
     for plan in plans.values():
         one, other = (p.execute(episode, plan.actions) for p in planners.values())
         assert other.score == pytest.approx(one.score, abs=1e-3)

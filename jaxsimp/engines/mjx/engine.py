@@ -180,7 +180,7 @@ def _mjx() -> Any:
 
 @dataclass(frozen=True)
 class MJX:
-    """MJX as the engine of a planner: `Planner(task, config, engine=MJX())`.
+    """MJX as the engine of a planner: `Planner(task, engine=MJX())`.
 
     For ropes and small cloths, with patience: bodies of more than `MOST_PARTICLES` are refused.
     They pass through themselves: MJX has no flexible bodies.
