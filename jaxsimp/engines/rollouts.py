@@ -22,13 +22,17 @@ def plan_cost(
     The terminal cost is of the state that is left an action's time after the pickers have let go.
     The paper adds up the same cost over all steps (section IV-A).
     """
+    is_one_cost = task.running_cost is task.terminal_cost  # which is then taken once
 
-    def both_costs(state: State, action: Actions) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        return task.running_cost(episode, state, action), task.terminal_cost(episode, state)
+    def observe(state: State, action: Actions) -> tuple[Float[Array, ""], ...]:
+        running = task.running_cost(episode, state, action)
+        return (running,) if is_one_cost else (running, task.terminal_cost(episode, state))
 
     start = at_rest(episode.start)
-    _, (running, terminal) = engine.rollout(physics, start, then_idle(actions, 1), both_costs)
-    costs = jnp.concatenate([running[..., :-1], terminal[..., -1:]], axis=-1)
+    _, (running, *terminal) = engine.rollout(physics, start, then_idle(actions, 1), observe)
+    costs = running
+    if terminal:
+        costs = jnp.concatenate([running[..., :-1], terminal[0][..., -1:]], axis=-1)
     return engine.risk(costs.sum(axis=-1))
 
 
