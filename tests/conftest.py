@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import jax
+import jaxlib
 import jaxtyping
 import matplotlib
 import pytest
@@ -16,6 +17,13 @@ from hypothesis import HealthCheck, settings
 from matplotlib.figure import Figure
 
 matplotlib.use("Agg")
+
+# XLA's older emitters compile in about 0.6 of the time, which is most of that of a test: the same
+# programs, in other machine code. `JAXSIMP_DEFAULT_EMITTERS=1` leaves XLA as users have it, as
+# `.ci/run` does for the numerical tests. A flag that an XLA does not know ends the process.
+EMITTERS = "--xla_cpu_use_fusion_emitters=false"
+if jaxlib.version.__version_info__ < (0, 11) and not os.environ.get("JAXSIMP_DEFAULT_EMITTERS"):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {EMITTERS}".strip()
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
