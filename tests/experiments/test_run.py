@@ -42,20 +42,6 @@ def untimed(rows: list[dict]) -> list[dict]:
     return [{name: row[name] for name in row if name not in TIMINGS} for row in rows]
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory, figures_saved):
-    """The results of a tiny study, and its figures by the names of their files."""
-    folder = tmp_path_factory.mktemp("results") / "tiny"
-    with figures_saved() as figures:
-        assert command(*OPTIONS, "--out", folder) == 0
-    return folder, figures
-
-
-@pytest.fixture(scope="module")
-def folder(results):
-    return results[0]
-
-
 # --- what a study leaves behind -------------------------------------------------------------------
 
 

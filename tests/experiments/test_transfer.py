@@ -38,20 +38,6 @@ def finished(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory, figures_saved):
-    """The results of a tiny study, and its figures by the names of their files."""
-    folder = tmp_path_factory.mktemp("results") / "tiny"
-    with figures_saved() as figures:
-        assert command(*OPTIONS, "--out", folder) == 0
-    return folder, figures
-
-
-@pytest.fixture(scope="module")
-def folder(results):
-    return results[0]
-
-
 @pytest.mark.slow
 def test_summary_has_its_schema(folder):
     summary = finished(folder)

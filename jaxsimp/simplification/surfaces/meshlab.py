@@ -46,20 +46,10 @@ def simplify_meshlab(
     until the Hausdorff distance is below the tolerance (see `fewest_vertices`). MeshLab may
     leave more triangles than it was asked for.
 
-    Args:
-        body: a body with triangles.
-        goals: goal positions, shape (B, N, 3), metres.
-        tolerance: Hausdorff distance below which a mesh fits, metres; a tenth of the
-            body's size by default.
-        max_size: largest number of key points tried; 24 by default.
-
-    Returns:
-        Key points of each goal. Where no mesh of up to `max_size` vertices fits the status is
-        `NO_FIT` and it is the best of them.
+    Arguments and result are those of `simplify_quadric`.
 
     Raises:
-        ValueError: if the body has no triangles, a goal is not one of this body, the tolerance
-            is not above zero, or `max_size` is below 4.
+        ValueError: as `simplify_quadric` does.
         ImportError: if pymeshlab is not installed.
     """
     tolerance = 0.1 * body.size if tolerance is None else tolerance
