@@ -55,8 +55,8 @@ class PlanOptions:
     num_actions: int | None = None
     """Actions in a plan (the horizon), instead of the budget's."""
     planning: Literal["nominal", "robust", "self_contact", "mixed"] = "nominal"
-    """What the search judges plans in: the body's physics alone, an ensemble of them, the body
-    touching itself, or the last for cloths and the first for ropes."""
+    """Physics of the search: the body's physics alone, an ensemble of them, the body touching
+    itself, or the last for cloths and the first for ropes."""
     self_contact: bool = True
     """Carry out and score plans that were found with the body touching itself."""
     out: Path | None = None

@@ -26,8 +26,8 @@ from jaxsimp.tasks import Task, make_task, task_names
 
 ACTION_SPACES = ("key_points", "all_particles")
 PLANNING = ("nominal", "robust", "self_contact", "mixed")
-"""A search judges plans in the body's own physics alone, in an ensemble of them, with self-contact,
-or with self-contact where the body is a cloth, whose folds have layers."""
+"""Physics of a search: the body's own physics alone, an ensemble of them, with self-contact, or with
+self-contact where the body is a cloth, whose folds have layers."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
 IDENTITY = ("task", "action_space", "pick_encoding", "seed")
@@ -149,7 +149,7 @@ class PlanStudy:
         return dataclasses.replace(config, **self.settings)
 
     def planning_of(self, task: Task) -> str:
-        """What judges plans of a task in the search: one of `PLANNING`, but not "mixed"."""
+        """Physics of the search of a task: one of `PLANNING`, but not "mixed"."""
         if self.planning != "mixed":
             return self.planning
         return "self_contact" if len(task.body.faces) else "nominal"

@@ -213,8 +213,8 @@ class TransferOptions(PlanOptions):
     pick_encodings: tuple[str, ...] = ("categorical",)
     """How CEM encodes what is grasped."""
     planning: Literal["nominal", "robust", "self_contact", "mixed"] = "mixed"
-    """What the search judges plans in: the body's physics alone, an ensemble of them, the body
-    touching itself, or the last for cloths and the first for ropes."""
+    """Physics of the search: the body's physics alone, an ensemble of them, the body touching
+    itself, or the last for cloths and the first for ropes."""
     plans: Path | None = None
     """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
 

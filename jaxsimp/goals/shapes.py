@@ -72,7 +72,7 @@ def letter(body: Body, name: str, slack: float = 0.0) -> Positions:
     Args:
         body: a rope.
         name: of the letter.
-        slack: share of the rest length by which the letter is shorter than the rope, below 1.
+        slack: fraction of the rest length by which the letter is shorter than the rope, below 1.
 
     Raises:
         ValueError: if there is no such letter, or the slack is not from 0 to below 1.
@@ -87,7 +87,7 @@ def crossed_triangle(body: Body, slack: float = 0.0, tail: float = 0.5) -> Posit
 
     Args:
         body: a rope.
-        slack: share of the rest length by which the line is shorter than the rope, below 1.
+        slack: fraction of the rest length by which the line is shorter than the rope, below 1.
         tail: length of an end beyond the crossing, over the side of the triangle.
 
     Raises:
@@ -142,7 +142,9 @@ def lift_crossings(body: Body, positions: Positions) -> Positions:
 def _laid_along(body: Body, line: np.ndarray, slack: float) -> Positions:
     """A rope along a line of any size, scaled to the rope's length and centred."""
     if not 0 <= slack < 1:
-        raise ValueError(f"slack is {slack:g}; give a share of the rest length, from 0 to below 1")
+        raise ValueError(
+            f"slack is {slack:g}; give a fraction of the rest length, from 0 to below 1"
+        )
     length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
     # The neighbours' rest lengths: a rope at rest need not be straight.
     rest_length = np.linalg.norm(np.diff(body.rest, axis=0), axis=1).sum()

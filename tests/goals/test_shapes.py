@@ -179,7 +179,7 @@ def test_slack_is_a_share(slack):
         lambda: goals.letter(rope(), "C", slack),
         lambda: goals.crossed_triangle(rope(), slack),
     ):
-        with pytest.raises(ValueError, match=r"slack is .*; give a share of the rest length"):
+        with pytest.raises(ValueError, match=r"slack is .*; give a fraction of the rest length"):
             make()
 
 

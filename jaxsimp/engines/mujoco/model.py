@@ -1,4 +1,4 @@
-"""Bodies as flexible bodies of MuJoCo: the same sheet or rope, in physics that we did not write.
+"""Bodies as flexible bodies of MuJoCo: the same sheet or rope in a reference engine.
 
 A particle becomes a body on three slide joints, so `qpos = position - rest` loads any of our
 states. What corresponds and how:
