@@ -26,7 +26,7 @@ from jaxsimp.tasks import Task, make_task, task_names
 
 ACTION_SPACES = ("key_points", "all_particles")
 PLANNING = ("nominal", "robust", "self_contact", "mixed")
-"""Physics of a search: the body's own physics alone, an ensemble of them, with self-contact, or with
+"""Physics of a search: the body's own alone, an ensemble of them, with self-contact, or with
 self-contact where the body is a cloth, whose folds have layers."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
