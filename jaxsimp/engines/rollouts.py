@@ -22,7 +22,8 @@ def plan_cost(
     The terminal cost is of the state that is left an action's time after the pickers have let go.
     The paper adds up the same cost over all steps (section IV-A).
     """
-    is_one_cost = task.running_cost is task.terminal_cost  # which is then taken once
+    terminal_cost: object = task.terminal_cost
+    is_one_cost = task.running_cost is terminal_cost  # which is then taken once
 
     def observe(state: State, action: Actions) -> tuple[Float[Array, ""], ...]:
         running = task.running_cost(episode, state, action)
