@@ -70,7 +70,7 @@ def test_dir_lists_the_face_before_anything_is_loaded():
 
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'jaxsimp' has no attribute 'simplfy'"):
-        js.simplfy  # noqa: B018
+        js.simplfy  # noqa: B018, as the access is what is tested
     with pytest.raises(ImportError, match="simplfy"):
         exec("from jaxsimp import simplfy")
 

@@ -69,7 +69,17 @@ class RolloutExecutor:
         return self._compiled.compile_seconds
 
     def __call__(self, episode: Episode, actions: Actions) -> Execution:
-        """Carry out a plan, let the body settle, and score it."""
+        """Carry out a plan, let the body settle, and score it.
+
+        Raises:
+            ValueError: if the plan has not as many actions and pickers as the task.
+        """
+        wanted = self._task.num_actions, self._task.num_pickers
+        if actions.pick.shape != wanted:
+            raise ValueError(
+                f"the plan has {actions.pick.shape} actions and pickers, and {self._task.name} "
+                f"takes {wanted}; give a plan of the task, or the task another num_actions"
+            )
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
         shared = (self._physics, as_float(episode))
         (positions,), (value,), missed = self._compiled(shared, one)

@@ -115,7 +115,7 @@ class Planner:
         algorithm = algorithm or CEM()
         space = action_space(self.task, candidates)
         compile_seconds = self.prepare(algorithm, space)
-        bill = _Bill(partial(self._told, as_float(episode)))
+        bill = _Bill(partial(self._told, as_float(episode)), _largest_population(algorithm))
         start = time.perf_counter()
         optimum = search_on_host(algorithm, space, jax.random.key(seed), bill, on_ask)
         jax.block_until_ready(optimum)
@@ -141,7 +141,7 @@ class Planner:
         """
         start = time.perf_counter()
         for stage in stages(algorithm):
-            self._map(stage.wants, stage.num_plans)
+            self._evaluation(stage.wants, stage.num_plans)
             if space is not None:
                 compiled_exchanges(stage, space, archive_size(algorithm))
         return time.perf_counter() - start
@@ -153,7 +153,11 @@ class Planner:
             episode: start and goal.
             actions: the plans, shapes (B, T, G) and (B, T, G, 3).
         """
-        return np.asarray(self._told(as_float(episode), "cost", actions).costs)
+        sizes = [
+            size for wants, size in self._maps if wants == "cost" and size >= len(actions.pick)
+        ]
+        size = min(sizes, default=len(actions.pick))
+        return np.asarray(self._told(as_float(episode), "cost", actions, size).costs)
 
     def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
         """Seconds that a plan takes, from one evaluation of plans that grasp and move anything.
@@ -165,7 +169,7 @@ class Planner:
             drawn = self._random_plans(stage.num_plans)
             self.prepare(stage)
             start = time.perf_counter()
-            self._told(episode, stage.wants, drawn)
+            self._told(episode, stage.wants, drawn, stage.num_plans)
             seconds += (time.perf_counter() - start) * stage.num_asks
         return seconds
 
@@ -185,15 +189,18 @@ class Planner:
         moves = rng.uniform(-1, 1, (*shape, 3)) * task.limits
         return Actions(jnp.asarray(picks), jnp.asarray(moves, float))
 
-    def _told(self, episode: Episode, wants: Wants, actions: Actions) -> Told:
-        """What is wanted of plans, evaluated on all cores."""
-        problem, evaluate = self._map(wants, len(actions.pick))
+    def _told(self, episode: Episode, wants: Wants, actions: Actions, size: int) -> Told:
+        """What is wanted of at most `size` plans, evaluated on all cores."""
+        problem, evaluate = self._evaluation(wants, size)
         return evaluate(dataclasses.replace(problem, episode=episode), actions)
 
-    def _map(self, wants: Wants, size: int) -> tuple[TaskProblem, PopulationMap]:
-        """A problem, and its evaluation compiled for `size` plans or more."""
-        fitting = [key for key in self._maps if key[0] == wants and key[1] >= size]
-        key = min(fitting, default=(wants, size))
+    def _evaluation(self, wants: Wants, size: int) -> tuple[TaskProblem, PopulationMap]:
+        """A problem, and its evaluation compiled for `size` plans.
+
+        Of that size and no other that is at hand: how a plan rounds depends on the size, and must
+        not depend on what was planned before.
+        """
+        key = wants, size
         if key not in self._maps:
             problem = self._settled_problem if wants == "settled" else self._problem
             self._maps[key] = problem, self._compiled(problem, wants, size)
@@ -207,7 +214,7 @@ class Planner:
 
     def layout_of(self, algorithm: Algorithm) -> Layout:
         """How the plans of an algorithm's question are laid on this machine."""
-        problem, _ = self._map(algorithm.wants, algorithm.num_plans)
+        problem, _ = self._evaluation(algorithm.wants, algorithm.num_plans)
         return self._layout(problem, algorithm.wants, algorithm.num_plans)
 
     def _layout(self, problem: TaskProblem, wants: Wants, size: int) -> Layout:
@@ -231,6 +238,12 @@ class Planner:
         return dataclasses.replace(found, episode=as_float(found.episode))
 
 
+def _largest_population(algorithm: Algorithm | Sequence) -> int:
+    """Plans that the costs of an algorithm are compiled for, at most; 1 if it asks for none."""
+    wanted = [stage.num_plans for stage in stages(algorithm) if stage.wants == "cost"]
+    return max(wanted, default=1)
+
+
 def _evaluate(wants: Wants, problem: TaskProblem, actions: Actions) -> Told:
     return evaluation(problem, wants)(actions)
 
@@ -243,12 +256,21 @@ class _Bill:
         price: of them, in rollouts.
     """
 
-    def __init__(self, evaluate: Callable[[Wants, Actions], Told]) -> None:
-        self._evaluate = evaluate
+    def __init__(self, evaluate: Callable[[Wants, Actions, int], Told], population: int) -> None:
+        """Nothing is counted yet.
+
+        Args:
+            evaluate: what is wanted of plans, compiled for as many plans as its last argument.
+            population: that the cost of one plan is compiled for.
+        """
+        self._evaluate, self._population = evaluate, population
         self.num_plans = self.price = 0
 
     def __call__(self, wants: Wants, actions: Actions) -> Told:
         """What is wanted of plans."""
         self.num_plans += len(actions.pick)
         self.price += PRICES[wants] * len(actions.pick)
-        return self._evaluate(wants, actions)
+        is_one_cost = wants == "cost" and len(actions.pick) == 1
+        return self._evaluate(
+            wants, actions, self._population if is_one_cost else len(actions.pick)
+        )

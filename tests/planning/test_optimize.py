@@ -333,7 +333,7 @@ def test_optimize_costs_plans_of_a_task_as_a_planner_does(name):
     together = jax.jit(jax.vmap(costs_of))(stacked)
     alone = jax.jit(costs_of)
     for index, episode in enumerate(episodes):
-        costs, choice, direction = alone(jax.tree.map(lambda leaf: leaf[index], stacked))  # noqa: B023
+        costs, choice, direction = alone(jax.tree.map(lambda leaf, i=index: leaf[i], stacked))
         pick = jnp.array([0, 8, NONE])[choice]
         limits = jnp.broadcast_to(jnp.asarray(task.limits, float), direction.shape)
         # float32, other machine code: 1e-7 a step, over some tens of steps of a damped body.

@@ -287,3 +287,33 @@ def test_a_loaded_plan_replays_bit_for_bit(tmp_path):
     replay = planner().execute(saved.episode, saved.actions)
     np.testing.assert_array_equal(replay.positions, saved.positions)
     assert replay.score == execution.score
+
+
+# --- whatever was planned before -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", [3, 64])
+def test_a_plan_does_not_depend_on_what_was_planned_before(first):
+    task = dataclasses.replace(
+        make_task("cloth_side_folding", 5), num_actions=1, action_seconds=0.1, settle_actions=1
+    )
+    episode, candidates = task.episode_fn(0), np.array([0, 4, 20, 24])
+
+    def with_population(size: int) -> CEM:
+        return CEM(2, size, initial_populations=1, keep_best=False, returns="mean")
+
+    used, wanted = Planner(task), Planner(task)
+    used.plan(episode, candidates, with_population(first))
+    found = used.plan(episode, candidates, with_population(12)).optimum
+    alone = wanted.plan(episode, candidates, with_population(12)).optimum
+    np.testing.assert_array_equal(found.best_costs, alone.best_costs)
+    assert found.cost == alone.cost
+    sizes = {size for _, size in used._maps}
+    assert sizes == {first, 12}  # none was padded to the size of another, nor compiled for one plan
+
+
+def test_a_plan_of_another_length_is_refused():
+    task = dataclasses.replace(make_task("rope_folding", 5), num_actions=2)
+    plan = Actions(jnp.zeros((3, 2), int), jnp.zeros((3, 2, 3)))
+    with pytest.raises(ValueError, match=r"has \(3, 2\) actions and pickers.*takes \(2, 2\); give"):
+        Planner(task).execute(task.episode_fn(0), plan)
