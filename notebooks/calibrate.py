@@ -47,7 +47,7 @@ from jaxsimp.calibration import (
 from jaxsimp.dynamics import Actions, at_rest
 
 SMALL = os.environ.get("JAXSIMP_NOTEBOOK_SIZE") == "small"  # the size that the tests run
-num_actions, steps = 8, 80 if SMALL else 150
+num_actions, steps = (6, 80) if SMALL else (8, 150)
 action_seconds, mujoco_step = 0.05, 5e-4
 longest = 1e-3  # time step of replays, seconds
 

@@ -18,18 +18,21 @@ from matplotlib.figure import Figure
 
 matplotlib.use("Agg")
 
-# XLA's older emitters compile in about 0.6 of the time, which is most of that of a test: the same
-# programs, in other machine code. `JAXSIMP_DEFAULT_EMITTERS=1` leaves XLA as users have it, as
-# `.ci/run` does for the numerical tests. A flag that an XLA does not know ends the process.
+# Most of the time of a test goes into compilation. Little optimisation and XLA's older emitters
+# make of the same operations other machine code in less than half of it; what it gives differs by
+# rounding. `JAXSIMP_OPTIMISED=1` leaves XLA as users have it, as `.ci/run` does for the tests of
+# numbers. A flag that an XLA does not know ends the process.
 EMITTERS = "--xla_cpu_use_fusion_emitters=false"
-if jaxlib.version.__version_info__ < (0, 11) and not os.environ.get("JAXSIMP_DEFAULT_EMITTERS"):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {EMITTERS}".strip()
+if not os.environ.get("JAXSIMP_OPTIMISED"):
+    jax.config.update("jax_disable_most_optimizations", True)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"  # for processes that tests start
+    if jaxlib.version.__version_info__ < (0, 11):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {EMITTERS}".strip()
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# Most of the time goes into compilation, and much of it into programs that were compiled before:
-# by another planner, an earlier test or the process that started this one. They are kept for as
-# long as this process lives, in a folder of its own, since JAX does not write them in one piece.
+# Many programs were compiled before: by another planner, an earlier test or the process that
+# started this one. They are kept for as long as this process lives, in a folder of its own, since JAX does not write them in one piece.
 # A test that passes must not owe it to what an earlier run left on disk.
 programs = tempfile.mkdtemp(prefix="jaxsimp-tests-")
 atexit.register(shutil.rmtree, programs, ignore_errors=True)
@@ -40,7 +43,7 @@ KEPT = {
 }
 for name, value in KEPT.items():
     jax.config.update(name, value)
-    os.environ[name.upper()] = str(value)  # for processes that tests start
+    os.environ[name.upper()] = str(value)
 
 settings.register_profile(
     "house",
@@ -90,20 +93,21 @@ def unchecked_shapes() -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", before)
 
 
-@pytest.fixture(scope="module")
-def compiled_quickly() -> Iterator[None]:
-    """Little optimisation: where code runs for a millisecond, and it is not its speed that counts.
+@pytest.fixture(scope="session", autouse=True)
+def coarse_figures() -> Iterator[None]:
+    """Figures are written with few dots: nobody looks at them, and most of the time is the dots."""
+    plain = Figure.savefig
 
-    The same operations are compiled, in less time; what they give differs by rounding.
-    """
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+    def savefig(self: Figure, path: str | Path, **options: object) -> None:
+        plain(self, path, **(options | {"dpi": 20}))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", savefig)
+        yield
 
 
 @pytest.fixture(scope="session")
-def figures_saved() -> Callable[[], AbstractContextManager[dict[str, Figure]]]:
+def figures_saved(coarse_figures: None) -> Callable[[], AbstractContextManager[dict[str, Figure]]]:
     """A context that collects the figures written in it, by the names of their files.
 
     What a figure shows is in its artists, their data and labels; a file says only that it exists.

@@ -29,7 +29,6 @@ from jaxsimp.calibration import (
 from jaxsimp.dynamics import NONE, Actions, State, at_rest, make_pickers, make_simulation, rollout
 
 # Most of the time is compilation, of which `calibrate` itself asks for little.
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 SECONDS = 0.08
 """Of an action."""

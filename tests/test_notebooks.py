@@ -15,7 +15,6 @@ def execute(text: str, monkeypatch):
     nbclient = pytest.importorskip("nbclient")
     monkeypatch.setenv("JAXSIMP_NOTEBOOK_SIZE", "small")
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")  # it compiles longer than it runs
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     monkeypatch.setenv("PYTHONPATH", path.rstrip(os.pathsep))
     notebook = jupytext.reads(text, fmt="py:percent")

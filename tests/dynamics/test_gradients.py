@@ -18,7 +18,6 @@ from jaxsimp.dynamics import NONE, Actions, State, make_pickers, make_simulation
 from jaxsimp.dynamics.springs import make_springs, pull, spring_tensions
 
 # Most of the time is compilation; what is compared are derivatives and sums, not speed.
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 ROPE = rope(8, 0.2)
 CLOTH = cloth((3, 2), (0.06, 0.03))

@@ -13,9 +13,6 @@ from jaxsimp.dynamics import Actions, Simulation, State, make_pickers, make_simu
 from jaxsimp.dynamics import springs as springs_module
 from jaxsimp.dynamics.springs import pull, spring_tensions
 
-# Most of the time is compilation; what is compared are derivatives and sums, not speed.
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
-
 BODIES = {"rope": rope(9, 0.2), "cloth": cloth((5, 4))}
 bodies = pytest.mark.parametrize("body", BODIES.values(), ids=BODIES)
 

@@ -29,7 +29,7 @@ from jaxsimp.planning import CEM, Planner
 from jaxsimp.tasks import make_task
 
 # MJX relies on rank promotion.
-pytestmark = pytest.mark.usefixtures("rank_promotion", "compiled_quickly")
+pytestmark = pytest.mark.usefixtures("rank_promotion")
 
 BODIES = {
     "rope": lambda: rope(7),

@@ -43,7 +43,6 @@ TINY = dataclasses.replace(
 )
 
 # Most of the time here is compilation of code that then runs for a millisecond.
-pytestmark = pytest.mark.usefixtures("compiled_quickly")
 
 
 def run(*options: object) -> int:
@@ -72,7 +71,7 @@ Results = tuple[tuple[str, ...], Path, dict[str, Figure]]
 
 
 @pytest.fixture(scope="module")
-def measure(without_peers, compiled_quickly, tmp_path_factory, figures_saved):
+def measure(without_peers, tmp_path_factory, figures_saved):
     """A tiny run of some sections."""
 
     def measured(*names: str) -> Results:

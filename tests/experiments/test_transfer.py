@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import run, transfer
+from experiments import run, transfer, transfer_report
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.transfer import planned_study, replay_path
 from jaxsimp.engines import Execution, MassSprings, make_ensemble
@@ -36,6 +36,12 @@ def command(*options: str) -> int:
 
 def finished(folder: Path) -> dict:
     return json.loads((folder / "summary.json").read_text())
+
+
+@pytest.fixture
+def without_pictures(monkeypatch):
+    """Reports that show no plans: drawing them takes half the time of a study."""
+    monkeypatch.setattr(transfer_report, "_shown", lambda rows: {})
 
 
 @pytest.mark.slow
@@ -101,6 +107,7 @@ def test_figures_show_the_scores_and_the_report_shows_the_figures(results):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_pictures")
 def test_a_study_cut_short_goes_on_to_the_same_rows(folder, tmp_path):
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     (copy / "summary.json").unlink()
@@ -112,6 +119,7 @@ def test_a_study_cut_short_goes_on_to_the_same_rows(folder, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_pictures")
 def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
     # The folder of a study of transfer holds plans as any other study's does, but for the
     # configuration, which is the one of the study inside.
@@ -135,6 +143,7 @@ def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_pictures")
 def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
     options = (*OPTIONS, "--tasks", "rope_folding", "--planning", "robust")
     out = tmp_path / "robust"
@@ -175,6 +184,7 @@ def test_what_judges_plans_is_part_of_what_a_study_is():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_pictures")
 def test_plans_with_self_contact_are_those_of_its_physics(tmp_path):
     out = tmp_path / "touching"
     options = (*OPTIONS, "--tasks", "rope_folding", "--planning", "self_contact")
