@@ -32,8 +32,9 @@ if not os.environ.get("JAXSIMP_OPTIMISED"):
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Many programs were compiled before: by another planner, an earlier test or the process that
-# started this one. They are kept for as long as this process lives, in a folder of its own, since JAX does not write them in one piece.
-# A test that passes must not owe it to what an earlier run left on disk.
+# started this one. They are kept for as long as this process lives, in a folder of its own, since
+# JAX does not write them in one piece. A test that passes must not owe it to what an
+# earlier run left on disk.
 programs = tempfile.mkdtemp(prefix="jaxsimp-tests-")
 atexit.register(shutil.rmtree, programs, ignore_errors=True)
 KEPT = {

@@ -1,8 +1,8 @@
 """The README and the pages of docs/: their Python runs, and their commands can be read.
 
 Python blocks of a page run in one namespace, from top to bottom, as they stand. So that this does
-not take minutes, tasks are made at their small scale (`SMALL`). Commands are not run: their options
-are read by the parsers of the commands.
+not take minutes, tasks and searches are made at a small scale (`SMALL`). Commands are not run:
+their options are read by the parsers of the commands.
 """
 
 import importlib.util
@@ -17,12 +17,14 @@ import pytest
 import tyro
 
 import jaxsimp
+import jaxsimp.planning
 import jaxsimp.tasks
+from jaxsimp.tasks import registry
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SMALL = {"make_task": {"quick": True}}
+SMALL = {"make_task": {"quick": True}, "CEM": {"population": 16}}
 """Functions of the face that blocks call at another size than the reader: arguments by default."""
 
 
@@ -99,9 +101,11 @@ def test_there_are_blocks_of_both_kinds():
 def test_python_blocks_run(page, monkeypatch, tmp_path):
     for name, options in SMALL.items():
         small = partial(getattr(jaxsimp, name), **options)
-        for module in (jaxsimp, jaxsimp.tasks):
-            monkeypatch.setattr(module, name, small)
+        for module in (jaxsimp, jaxsimp.planning, jaxsimp.tasks):
+            if hasattr(module, name):
+                monkeypatch.setattr(module, name, small)
     monkeypatch.chdir(tmp_path)  # for files that they write
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))  # for their tasks
     namespace = {"__name__": "__main__"}
     with jax.numpy_rank_promotion("allow"):  # as readers have it
         for line, code in blocks(page, "python"):

@@ -147,7 +147,8 @@ def largest_time_step(body: Body) -> float:
     # The positive root of k dt^2 + 2 c dt - 4 = 0, in a form that allows k = 0; it is
     # never beyond 2 / c.
     denominator = c + np.sqrt(c**2 + 4 * k)
-    return float(4 / denominator) if denominator > 0 else float("inf")
+    with np.errstate(over="ignore", divide="ignore"):
+        return float(np.divide(4.0, denominator))  # infinite where nothing acts
 
 
 def _largest_eigenvalue(body: Body, weight: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from numbers import Integral, Real
 from typing import Any
 
@@ -64,9 +64,12 @@ def check_costs(
     Raises:
         ValueError: if a cost takes other arguments, fails, or returns anything but one float.
     """
-    examples = partial(_examples, num_particles, num_pickers)
-    _check_cost("running_cost", running_cost, examples, ("episode", "state", "action"))
-    _check_cost("terminal_cost", terminal_cost, examples, ("episode", "state"))
+    for name, cost, arguments in (
+        ("running_cost", running_cost, ("episode", "state", "action")),
+        ("terminal_cost", terminal_cost, ("episode", "state")),
+    ):
+        check = _check_cost_once if _is_hashable(cost) else _check_cost
+        check(name, cost, num_particles, num_pickers, arguments)
 
 
 def check_draw(draw_fn: DrawFn, num_particles: int) -> None:
@@ -96,16 +99,13 @@ def _examples(num_particles: int, num_pickers: int) -> tuple[Episode, State, Act
 
 
 def _check_cost(
-    name: str, cost: Callable[..., Any], examples: Callable[[], Any], arguments: tuple[str, ...]
+    name: str,
+    cost: Callable[..., Any],
+    num_particles: int,
+    num_pickers: int,
+    arguments: tuple[str, ...],
 ) -> None:
-    """Refuse one cost.
-
-    Args:
-        name: name of the cost.
-        cost: the cost.
-        examples: makes an episode, a state and an action, under a trace.
-        arguments: names of the arguments of the cost: the first of the examples.
-    """
+    """Refuse one cost; `arguments` are names of what it takes: the first of the examples."""
     try:
         inspect.signature(cost).bind(*arguments)
     except TypeError as error:
@@ -114,6 +114,7 @@ def _check_cost(
             f"function of these arguments"
         ) from error
     remedy = "it must accept positions of shape (N, 3), and an action of shapes (G,) and (G, 3)"
+    examples = partial(_examples, num_particles, num_pickers)
     found = _trace(name, lambda: cost(*examples()[: len(arguments)]), remedy)
     if not isinstance(found, jax.ShapeDtypeStruct):
         raise ValueError(f"{name} returns a {type(found).__name__}; return one float, as a scalar")
@@ -123,6 +124,18 @@ def _check_cost(
         )
     if not jnp.issubdtype(found.dtype, jnp.floating):
         raise ValueError(f"{name} returns a scalar of type {found.dtype}; return a float")
+
+
+_check_cost_once = lru_cache(maxsize=64)(_check_cost)
+"""Costs of tasks that differ in other things are traced once; a refusal is not kept."""
+
+
+def _is_hashable(cost: Callable[..., Any]) -> bool:
+    try:
+        hash(cost)
+    except TypeError:
+        return False
+    return True
 
 
 def _trace(name: str, call: Callable[[], Any], remedy: str) -> PyTree[Any]:
