@@ -44,7 +44,7 @@ def towel(
         length: along y, metres.
         width: along x, metres.
         num_particles: number of particles, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, or another argument is out of range.
@@ -87,7 +87,7 @@ def t_shirt(
         neck_depth: depth of the neck opening, metres.
         slope: slope of shoulders and sleeves, degrees below the x axis.
         num_particles: number of particles, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, the outline is not that of a T-shirt, or
@@ -149,7 +149,7 @@ def trousers(
         cuff: across the end of a leg, metres.
         spread: distance of each leg's end beyond the waist, outwards, metres; may be below zero.
         num_particles: number of particles, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, the outline is not that of trousers, or
@@ -185,7 +185,7 @@ def skirt(
         waist: across the top, metres.
         hem: across the bottom, metres.
         num_particles: number of particles, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, or another argument is out of range.
