@@ -1,12 +1,12 @@
 """jaxsimp: plan how to grasp and move rope and cloth, on a laptop's CPU.
 
-A goal (where every particle should end) is reduced to a few key points; they mask the action
-tensor; a planner searches actions by rolling a population through differentiable dynamics.
+A goal (the final position of every particle) is reduced to a few key points; they mask the action
+tensor; a planner searches actions with rollouts of a population in differentiable dynamics.
 
     import jaxsimp as js
 
-`js` offers the names below and the rooms they are from (`js.goals`, `js.viz`, ...). A name is
-loaded when it is first used, so that `import jaxsimp` itself imports no other library.
+`js` has the names below and their rooms, the subpackages (`js.goals`, `js.viz`, ...). Each name
+is loaded at first use, so that `import jaxsimp` itself imports no other library.
 
 Words and axes, everywhere: `N` particles, `K` key points, `T` actions in a plan, `G` pickers,
 `B` population, `S` springs, `F` triangles; the last axis of length 3 is x, y, z with z up.
@@ -15,7 +15,7 @@ Units are SI. `key` is a JAX PRNG key, `num_*` a count, `*_fn` a callable.
 
 from typing import TYPE_CHECKING
 
-# A name of the face stands in three places: here for people and type checkers, in `__all__`, and
+# The face lists each name in three places: here for readers and type checkers, in `__all__`, and
 # in the table of rooms at the end. tests/test_face.py compares them.
 if TYPE_CHECKING:
     from jaxsimp import (
@@ -226,13 +226,13 @@ _ROOMS = {
     "tasks": "Episode Task make_task register score task_names",
     "viz": "",
 }
-"""What the face offers: of each room the names that users need without naming the room."""
+"""Names of the face: for each room the names that `jaxsimp` exports directly."""
 
 if not TYPE_CHECKING:  # a type checker that saw this function would accept every name
     _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names.split()}
 
     def __getattr__(name: str) -> object:
-        """Load a name of the face when it is first used (PEP 562)."""
+        """Load a name of the face at its first use (PEP 562)."""
         from importlib import import_module
 
         if name in _ROOM_OF:
@@ -243,7 +243,7 @@ if not TYPE_CHECKING:  # a type checker that saw this function would accept ever
             value = _version()
         else:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        globals()[name] = value  # the next use does not come here
+        globals()[name] = value  # later uses do not call this function
         return value
 
 

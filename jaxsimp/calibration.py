@@ -1,7 +1,8 @@
-"""Calibration: the physics of a body from motions that were seen, by gradient descent.
+"""Calibration: the physics of a body from recorded motions, by gradient descent.
 
-Stiffness, damping, drag and friction are scaled until replays of recorded actions go through the
-recorded positions. The gradient goes backwards through every time step (adjoint.py).
+Factors on stiffness, damping, drag and friction minimise the distance of replays of recorded
+actions from the recorded positions. The gradient goes backwards through every time step
+(adjoint.py).
 """
 
 from collections.abc import Sequence
@@ -23,12 +24,12 @@ from jaxsimp.dynamics.simulation import Simulation, State, largest_time_step, ma
 from jaxsimp.dynamics.springs import make_springs
 
 LONGEST_TIME_STEP = 2e-3
-"""Of replays, seconds."""
+"""Longest time step of replays, seconds."""
 MOST_KINDS = 4
-"""Springs of more different stiffnesses than this have one factor together."""
+"""Number of different stiffnesses above which all springs share one factor."""
 
 Factors = dict[str, Float[Array, "..."]]
-"""By name of the parameter: shape (kinds,) for stiffness, () for the others."""
+"""Factors by name of the parameter: shape (kinds,) for stiffness, () for the others."""
 
 
 @partial(
@@ -36,12 +37,12 @@ Factors = dict[str, Float[Array, "..."]]
 )
 @dataclass(frozen=True)
 class Recording:
-    """A motion that was seen.
+    """A recorded motion.
 
     Attributes:
         start: positions and velocities before the first action, shape (N, 3).
-        actions: what pickers did, shapes (T, G) and (T, G, 3).
-        positions: after each action, shape (T, N, 3), metres.
+        actions: actions of the pickers, shapes (T, G) and (T, G, 3).
+        positions: positions after each action, shape (T, N, 3), metres.
     """
 
     start: State
@@ -54,12 +55,14 @@ class CalibrationConfig:
     """Settings of a calibration.
 
     Attributes:
-        parameters: which of `PARAMETERS` are fitted; the others stay the body's.
-        steps: of gradient descent (Adam, its learning rate falling to zero as a cosine).
-        learning_rate: the first, in natural logarithms of a factor.
-        largest_factor: on a parameter. All below it must be stable, so the time step gets
-            shorter with the root of it.
-        smallest_factor: on a parameter.
+        parameters: names in `PARAMETERS` to fit; the others keep the body's values.
+        steps: number of steps of gradient descent (Adam, with cosine decay of the learning rate
+            to zero).
+        learning_rate: initial learning rate, in natural logarithms of a factor.
+        largest_factor: largest factor on a parameter. All factors below it must be stable, so the
+            time step falls with its square root.
+        smallest_factor: smallest factor on a parameter.
+        longest_time_step: longest time step of replays, seconds.
 
     Raises:
         ValueError: if a parameter is unknown or a number is out of its range.
@@ -93,14 +96,14 @@ class CalibrationConfig:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What a calibration found.
+    """Result of a calibration.
 
     Attributes:
-        body: with the best physics that was met.
-        factors: of that physics on the body that was given; stiffness has one for each kind.
+        body: the body with the best physics found.
+        factors: factors of that physics relative to the given body; stiffness has one per kind.
         errors: root-mean-square distance of replays from the recordings before each step of
             the descent and at its end, shape (steps + 1,), metres; not finite where a replay
-            was not.
+            is not finite.
     """
 
     body: Body
@@ -119,26 +122,26 @@ def calibrate(
 ) -> Calibration:
     """Fit a body's physics to recordings.
 
-    Minimises the mean squared distance of particles from where they were seen, over the
-    logarithms of factors, from factors of 1. The first steps of the descent look at the first
-    actions only, and from half way on it looks at all: late motion depends on early motion in
-    ways so intricate that a descent on it alone gets stuck. Masses are taken as they are: forces
-    can be told from a motion only in proportion to them.
+    Minimises the mean squared distance of particles from their recorded positions, over the
+    logarithms of factors, from factors of 1. The first steps of the descent use the first actions
+    only, and the second half uses all actions: late motion depends on early motion in such a
+    complex way that a descent on all of it from the start gets stuck. Masses stay fixed, since a
+    motion determines forces only in proportion to masses.
 
     Args:
-        body: the first guess.
-        recordings: one or more, of equally many actions and pickers.
-        action_seconds: that each of their actions took.
+        body: the initial guess.
+        recordings: one or more recordings, with equal numbers of actions and of pickers.
+        action_seconds: duration of each of their actions, seconds.
         config: settings.
-        kinds: of the springs, counted from 0, shape (S,): those of one kind have one factor on
-            their stiffness. By default springs of equal stiffness are of one kind, and all of
-            them where there are more than `MOST_KINDS` stiffnesses, as in a mesh.
+        kinds: kind of each spring, counted from 0, shape (S,): springs of one kind share one
+            factor on their stiffness. By default springs of equal stiffness are of one kind, or
+            all springs if there are more than `MOST_KINDS` stiffnesses, as in a mesh.
         gravity: downward acceleration, metres per second squared.
 
     Raises:
         ValueError: if recordings do not fit the body or each other, hold a value that is not
-            finite or show no motion; if a parameter is to be fitted that is zero, or kinds are
-            not one for each spring.
+            finite or show no motion; if a parameter to fit is zero; or if `kinds` has not one
+            number for each spring.
     """
     config = config or CalibrationConfig()
     _check_seconds("action_seconds", action_seconds)
@@ -161,14 +164,14 @@ def simulate_recordings(
     gravity: float = 9.81,
     longest_time_step: float = LONGEST_TIME_STEP,
 ) -> Float[np.ndarray, "R T N 3"]:
-    """Where a body is after each action of recordings, metres.
+    """Positions of a body after each action of recordings, shape (R, T, N, 3), metres.
 
     Args:
-        body: whose physics is used.
+        body: the body, with its physics.
         recordings: as for `calibrate`.
-        action_seconds: that each of their actions took.
+        action_seconds: duration of each of their actions, seconds.
         gravity: downward acceleration, metres per second squared.
-        longest_time_step: seconds; shorter ones are taken where stability asks for them.
+        longest_time_step: longest time step, seconds; shorter where stability requires it.
 
     Raises:
         ValueError: as `calibrate` does for recordings.
@@ -183,7 +186,7 @@ def simulate_recordings(
 def recording_error(
     body: Body, recordings: Sequence[Recording], action_seconds: float, **options: float
 ) -> float:
-    """Root-mean-square distance, metres, of particles in replays from where they were seen.
+    """Root-mean-square distance, metres, of particles in replays from their recorded positions.
 
     See `simulate_recordings` for arguments, options and errors.
     """
@@ -196,7 +199,7 @@ def recording_error(
     jax.jit,
     static_argnums=(0, 1),
     static_argnames="num_kinds",
-    # Optimised less, gradients compile three times as fast, and run almost as fast.
+    # With less optimisation gradients compile three times as fast, and run almost as fast.
     compiler_options={"xla_backend_optimization_level": 1},
 )
 def _descend(
@@ -224,7 +227,7 @@ def _descend(
         finite = jnp.isfinite(loss) & _all_finite(gradient)
         gradient = _choose(finite, gradient, jax.tree.map(jnp.zeros_like, gradient))
         updates, state = optimizer.update(gradient, state)
-        # From where there is no gradient it goes on from the best.
+        # Where the gradient is not finite the descent continues from the best factors.
         logs = optax.apply_updates(_choose(finite, logs, best), updates)
         logs = jax.tree.map(lambda leaf: jnp.clip(leaf, low, high), logs)
         return (logs, state, best, least), loss
@@ -232,7 +235,7 @@ def _descend(
     logs = {name: jnp.zeros(num_kinds if name == "stiffness" else ()) for name in config.parameters}
     first = (logs, optimizer.init(logs), logs, jnp.asarray(jnp.inf))
     num_actions = recordings.positions.shape[1]
-    # From the first action to all of them, in the first half of the descent.
+    # The horizon grows from one action to all actions in the first half of the descent.
     horizons = jnp.clip(jnp.linspace(1.0, 2.0 * num_actions, config.steps), 1.0, num_actions)
     (logs, _, best, least), losses = jax.lax.scan(step, first, horizons)
     last = loss_fn(logs, horizons[-1])[1]
@@ -248,9 +251,9 @@ def _misfit(
     logs: Factors,
     horizon: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mean squared distance of replays up to a horizon, a number of actions, and of all.
+    """Mean squared distance of replays, up to a horizon (a number of actions), and of all actions.
 
-    In units of the motion, so that Adam's own epsilon is small beside it.
+    Relative to `_motion`, so that Adam's epsilon is small in comparison.
     """
     scaled = _scaled(simulation, table, jax.tree.map(jnp.exp, logs))
     missed = _replays(steps, scaled, recordings) - recordings.positions
@@ -260,14 +263,14 @@ def _misfit(
 
 
 def _motion(recordings: Recording) -> Float[Array, ""]:
-    """Mean squared distance of particles from where they started, square metres."""
+    """Mean squared distance of particles from their starting positions, square metres."""
     moved = recordings.positions - recordings.start.position[:, None]
     return jnp.mean(jnp.sum(moved**2, axis=-1))
 
 
 def _replays(steps: int, simulation: Simulation, recordings: Recording) -> Float[Array, "R T N 3"]:
     """Positions after each action, of all recordings."""
-    # Pickers did what they did: no limit applies.
+    # Recorded actions have no limit.
     pickers: Pickers = make_pickers((1e3, 1e3, 1e3), max_stretch=1e6, steps=steps)
 
     def one(recording: Recording) -> Float[Array, "T N 3"]:
@@ -294,24 +297,24 @@ def _scaled_body(body: Body, factors: dict[str, np.ndarray], kinds: Int[np.ndarr
 
 
 def _kind_table(body: Body, kinds: Int[np.ndarray, " S"]) -> Int[Array, "D HN"]:
-    """Kinds in the rows that springs are stored in; 0 where there is no spring."""
+    """Kinds in the rows of the stored springs; 0 where there is no spring."""
     table = make_springs(replace(body, stiffness=kinds + 1.0)).stiffness
     return jnp.maximum(table.astype(int) - 1, 0)
 
 
 def _extremes(config: CalibrationConfig) -> dict[str, np.ndarray]:
-    """The largest factors: the least stable physics that may be met."""
+    """The largest factors: the least stable physics that the descent may reach."""
     return {name: np.asarray(config.largest_factor) for name in config.parameters}
 
 
 def _time_step(body: Body, action_seconds: float, longest: float) -> tuple[float, int]:
-    """A time step that is stable, seconds, and how many of them an action has."""
+    """A stable time step, seconds, and the number of time steps per action."""
     steps = ceil(action_seconds / min(longest, 0.9 * largest_time_step(body)))
     return action_seconds / steps, steps
 
 
 def _stack(body: Body, recordings: Sequence[Recording]) -> Recording:
-    """Recordings along a first axis, if they fit the body and each other."""
+    """Recordings stacked along a first axis, if they fit the body and each other."""
     if not recordings:
         raise ValueError("there are no recordings; give at least one")
     shape = np.shape(recordings[0].actions.pick)
@@ -321,7 +324,7 @@ def _stack(body: Body, recordings: Sequence[Recording]) -> Recording:
         lambda *leaves: jnp.stack([_as_array(leaf) for leaf in leaves]), *recordings
     )
     if not np.any(np.asarray(stacked.positions != stacked.start.position[:, None])):
-        raise ValueError("no particle moves in any recording; nothing can be told from that")
+        raise ValueError("no particle moves in any recording; give a recording with motion")
     return stacked
 
 
@@ -373,7 +376,7 @@ def _check_fitted(body: Body, config: CalibrationConfig) -> None:
     zero = [name for name in config.parameters if not np.any(values[name])]
     if zero:
         raise ValueError(
-            f"{zero[0]} of the body is 0, and no factor changes that; start from a number "
+            f"{zero[0]} of the body is 0, and stays 0 times any factor; start from a number "
             f"above zero, or leave it out of `parameters`"
         )
 

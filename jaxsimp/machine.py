@@ -1,8 +1,8 @@
-"""What this machine has."""
+"""Resources of this machine."""
 
 import os
 
 
 def num_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

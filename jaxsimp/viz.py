@@ -1,4 +1,4 @@
-"""Pictures of bodies, models, searches and executed plans. matplotlib is imported when called."""
+"""Pictures of bodies, models, searches and executed plans. Each call imports matplotlib."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-"""Distinct for the colour-blind (Okabe and Ito)."""
+"""Colours distinct for colour-blind readers (Okabe and Ito)."""
 GOAL_COLOR = "#999999"
 Positions = Float[np.ndarray, "N 3"]
 
@@ -25,7 +25,7 @@ def plot_model_errors(models: Mapping[str, KeyPoints]) -> "Figure":
     """Error of the simplified model by number of key points (Fig. 2 of the paper).
 
     Args:
-        models: by the name of the task.
+        models: key points by the name of the task.
     """
     figure, panels = _panels(models)
     for axes, (name, model) in zip(panels, models.items(), strict=True):
@@ -48,7 +48,7 @@ def plot_models(models: Mapping[str, tuple[Body, Positions, KeyPoints]]) -> "Fig
 
 
 def plot_simplifications(models: Mapping[str, tuple[Body, Positions, KeyPoints]]) -> "Figure":
-    """Simplified models over their goals, and their errors by size beside them, a row a goal.
+    """Simplified models over their goals, with their errors by size, one row per goal.
 
     Args:
         models: body, goal and key points by the name of the goal.
@@ -70,8 +70,8 @@ def plot_costs(
     """Cost by iteration, mean with a 95 % confidence interval over runs (Fig. 4 of the paper).
 
     Args:
-        costs: for each task, for each method, one row a run, one column an iteration.
-        ylabel: what the cost is.
+        costs: costs by task, then method, shape (R, I): one row per run, one column per iteration.
+        ylabel: label of the cost axis.
     """
     figure, panels = _panels(costs)
     for axes, (name, methods) in zip(panels, costs.items(), strict=True):
@@ -96,14 +96,14 @@ def plot_scores(
     ylabel: str,
     success: float,
 ) -> "Figure":
-    """Scores of the same plans in two engines, a panel a task.
+    """Scores of the same plans in two engines, one panel per task.
 
     Args:
-        scores: for each task, for each method, a row a plan: its two scores; those that are not
-            finite are left out.
-        xlabel: what the first score is.
-        ylabel: what the second score is.
-        success: score of a plan that succeeds, a dashed line.
+        scores: scores by task, then method, shape (R, 2): the two scores of one plan per row; plans
+            with a score that is not finite are omitted.
+        xlabel: label of the first score.
+        ylabel: label of the second score.
+        success: least score of a success, drawn as a dashed line.
     """
     figure, panels = _panels(scores)
     for axes, (name, methods) in zip(panels, scores.items(), strict=True):
@@ -138,14 +138,14 @@ def plot_executions(
     executions: Mapping[str, tuple[Float[np.ndarray, "P N 3"], float]],
     title: str,
 ) -> "Figure":
-    """Snapshots of executed plans beside their goal, a row a plan (Fig. 5 of the paper).
+    """Snapshots of executed plans beside their goal, one row per plan (Fig. 5 of the paper).
 
     Args:
-        body: what moves.
-        goal: where it should end, metres.
-        executions: for each method the positions at the start, after each action, and
-            settled, and the score.
-        title: of the figure.
+        body: the body that the plans move.
+        goal: goal positions, shape (N, 3), metres.
+        executions: by method, positions at the start, after each action, and settled, shape
+            (P, N, 3), metres; and the score.
+        title: title of the figure.
     """
     import matplotlib.pyplot as plt
 
@@ -181,13 +181,13 @@ def plot_executions(
 def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> None:
     """Draw a rope as a line, a surface as shaded triangles with its boundary, into 3-D axes.
 
-    A body whose motion failed, with positions that are not finite, is left out.
+    Draws nothing if a position is not finite, as after a failed motion.
 
     Args:
-        axes: of a 3-D projection.
-        body: what is drawn.
+        axes: axes with a 3-D projection.
+        body: the body to draw.
         positions: shape (N, 3), metres.
-        color: of the body.
+        color: colour of the body.
     """
     if not np.isfinite(positions).all():
         return
@@ -213,7 +213,7 @@ def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> N
 
 def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -> None:
     """A model over its goal, into 3-D axes."""
-    axes.computed_zorder = False  # Key points lie in the goal: depth would hide some.
+    axes.computed_zorder = False  # key points lie in the goal: depth order would hide some
     draw_body(axes, body, goal, GOAL_COLOR)
     closed = model.elements[:, [*range(model.elements.shape[1]), 0]]
     for element in closed if model.elements.shape[1] > 2 else model.elements:
@@ -250,7 +250,7 @@ def _draw_errors(axes: "Axes", model: KeyPoints) -> None:
 
 
 def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.1) -> None:
-    """Equal scales around everything shown, seen from above at an angle, without axes."""
+    """Set equal scales around all positions, a view from above at an angle, and no axes."""
     points = np.concatenate(shown)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -262,7 +262,7 @@ def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.1) -> Non
         ylim=(middle[1] - span[1] / 2, middle[1] + span[1] / 2),
         zlim=(0, span[2]),
     )
-    # The box is scaled by its diagonal; a long one would be cut off at the zoom of a square.
+    # Matplotlib scales the box by its diagonal; the zoom of a square would cut off a long one.
     slender = np.linalg.norm(span) / (np.sqrt(2) * span.max())
     axes.set_box_aspect(span, zoom=zoom * min(1.0, slender))
     axes.view_init(elev=50, azim=-65)
@@ -270,7 +270,7 @@ def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.1) -> Non
 
 
 def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Figure", list[Any]]:
-    """A figure of one panel an item, two a row."""
+    """A figure with one panel per item, two per row."""
     import matplotlib.pyplot as plt
 
     columns = min(2, len(items))

@@ -1,8 +1,8 @@
-"""Bodies: what is simulated, simplified and planned for.
+"""Bodies: the type that simulation, simplification and planning share.
 
 A body is a mass-spring system: particles with masses, springs between pairs of particles, and (for
-surfaces) triangles, of one material. A rope and a cloth differ only in how these arrays are
-filled, so everything downstream knows one kind of body; `jaxsimp.bodies.constructors` makes them.
+surfaces) triangles, of one material. A rope and a cloth differ only in the values of these arrays,
+so all other code handles one type of body; `jaxsimp.bodies.constructors` makes them.
 
 All arrays are NumPy on the host and read-only; `jaxsimp.dynamics` turns a body into the arrays of
 a simulation.
@@ -29,28 +29,28 @@ class Body:
     """A mass-spring system of `N` particles, `S` springs and `F` triangles.
 
     A simulation takes masses, stiffness and damping from the arrays, and all other parameters from
-    the material. The constructors fill the arrays from the material; springs may differ from it
-    one by one. Arrays are copied, and read-only, also after unpickling.
+    the material. The constructors fill the arrays from the material; each spring may differ from
+    it. Arrays are copied, and read-only, also after unpickling.
 
     Attributes:
         name: the kind of body, for messages and reports.
         rest: rest coordinates, shape (N, 3), metres: the unstretched body, its lowest point at
-            z = 0, centred along x and y. Flat, but for a mesh that is not.
+            z = 0, centred along x and y. Flat, except for a mesh that is not flat.
         mass: particle masses, shape (N,), kilograms.
         springs: particle ids of the spring ends, shape (S, 2), no pair twice.
-        families: of each spring, the index of its family in `FAMILIES`, shape (S,): 0 for
-            stretch, 1 for shear, 2 for bend.
+        families: index of each spring's family in `FAMILIES`, shape (S,): 0 for stretch, 1 for
+            shear, 2 for bend.
         rest_length: spring lengths at zero force, shape (S,), metres.
         stiffness: spring stiffness, shape (S,), newtons per metre.
         damping: force per rate of elongation of the spring, shape (S,), newton-seconds per metre.
         faces: particle ids of the triangles, shape (F, 3); F = 0 for a rope.
         material: the physical parameters.
         shape: number of particles along each axis of a grid, `(rows, columns)` for a cloth;
-            `(N,)` for a body that is none, as a rope or a mesh.
+            `(N,)` for a body without a grid, as a rope or a mesh.
 
     Raises:
-        ValueError: if an array has the wrong shape or a value that no body can have, if there
-            are no particles, or if a spring joins a particle to itself or a pair joined before.
+        ValueError: if an array has the wrong shape or a value out of range, if there are no
+            particles, or if a spring joins a particle to itself or a pair already joined.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Body:
             require_positive(name, getattr(self, name))
 
     def __reduce__(self) -> tuple[type["Body"], tuple[Any, ...]]:
-        """Copies are made by the constructor: pickled arrays lose their read-only flag."""
+        """Make copies with the constructor, since pickled arrays lose their read-only flag."""
         return type(self), tuple(getattr(self, field.name) for field in fields(self))
 
     @property
@@ -106,16 +106,16 @@ class Body:
     def scaled(
         self, *, stiffness: float | Float[np.ndarray, " S"] = 1.0, **factors: float
     ) -> "Body":
-        """The body with its parameters times factors: arrays and material alike.
+        """The body with its parameters times factors, in the arrays and in the material.
 
         Args:
-            stiffness: on the stiffness of all springs, or of each one, shape (S,). The material's
-                stiffness of a family then has the median factor of its springs, or of all
-                springs if the family has none.
-            factors: by a name in `FACTORS`.
+            stiffness: factor on the stiffness of all springs, or of each one, shape (S,). The
+                material's stiffness of a family then has the median factor of its springs, or of
+                all springs if the family has none.
+            factors: factors of other parameters, by a name in `FACTORS`.
 
         Raises:
-            TypeError: if there is no parameter of such a name.
+            TypeError: if no parameter has a given name.
             ValueError: if a product is out of the parameter's range.
         """
         refuse_unknown(factors, FACTORS)

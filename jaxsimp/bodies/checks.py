@@ -1,4 +1,4 @@
-"""Refusals of numbers that no body can have."""
+"""Checks of numbers: a `ValueError` for a number out of range."""
 
 import numpy as np
 

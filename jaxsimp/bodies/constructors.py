@@ -1,7 +1,6 @@
 """Constructors of bodies: ropes, rectangular cloths, and sheets from triangle meshes.
 
-Each takes a material, by default that of its kind in `MATERIALS`, and parameters in which the body
-differs from it.
+Each takes a material, by default that of its kind in `MATERIALS`, and changes of single parameters.
 """
 
 import numpy as np
@@ -14,7 +13,7 @@ from jaxsimp.bodies.meshes import clean_mesh, face_areas, spring_weights
 from jaxsimp.bodies.topology import chain
 
 MASS = 0.02
-"""Default mass of a rope and of a cloth, whatever its size, kilograms."""
+"""Default mass of a rope and of a cloth of any size, kilograms."""
 
 
 def rope(
@@ -30,9 +29,9 @@ def rope(
     Args:
         num_particles: number of particles, at least 2.
         length: rest length, metres.
-        mass: of the whole rope, kilograms; it replaces the material's density. By default `MASS`,
-            or the density times the length where a material or a density is given.
-        material: `MATERIALS["rope"]` by default.
+        mass: mass of the whole rope, kilograms; replaces the material's density. By default
+            `MASS`, or the density times the length where a material or a density is given.
+        material: material of the rope, `MATERIALS["rope"]` by default.
         changes: parameters in which the rope differs from the material, as `drag=2.0`.
 
     Raises:
@@ -53,10 +52,10 @@ def rope_along(
     material: Material | None = None,
     **changes: float,
 ) -> Body:
-    """A rope that is at rest along given points, which need not be evenly spread.
+    """A rope at rest along given points, which may be unevenly spaced.
 
     Args:
-        points: of the particles in order, shape (N, 3), metres; N is at least 2.
+        points: positions of the particles in order, shape (N, 3), metres; N is at least 2.
         mass: as for `rope`.
         material: as for `rope`.
         changes: as for `rope`.
@@ -94,9 +93,9 @@ def cloth(
     Args:
         shape: number of rows and of columns, each at least 2.
         size: extent along x and along y, metres.
-        mass: of the whole cloth, kilograms; it replaces the material's density. By default
+        mass: mass of the whole cloth, kilograms; replaces the material's density. By default
             `MASS`, or the density times the area where a material or a density is given.
-        material: `MATERIALS["cloth"]` by default.
+        material: material of the cloth, `MATERIALS["cloth"]` by default.
         changes: parameters in which the cloth differs from the material, as `drag=2.0`.
 
     Raises:
@@ -127,30 +126,30 @@ def from_mesh(
     """A sheet of any shape: particles at the points of a triangle mesh.
 
     The mesh is cleaned first (see `jaxsimp.bodies.meshes.clean_mesh`): particles are its points in
-    their order, without copies and points of no triangle. It is at rest as it is given, its
-    lowest point put at z = 0, centred along x and y. A particle has a third of the mass of
-    each of its triangles.
+    their order, without copies and points of no triangle. The given shape is the rest shape, with
+    its lowest point moved to z = 0, and centred along x and y. A particle has a third of the mass
+    of each of its triangles.
 
     Stretch springs lie along the edges, bend springs across each edge of two triangles, from
-    corner to corner. Stiffness and damping are the sheet's, shared out by the weights of
-    `jaxsimp.bodies.meshes.spring_weights`, so that in its plane the sheet does not depend to first
-    order on how finely it is meshed. On equilateral triangles its Young's modulus times
-    thickness is the sum of both stiffnesses. Out of the plane only bend springs that shorten
-    resist: that is of higher order, and weaker in a finer mesh, as in `cloth`.
+    corner to corner. Stiffness and damping are the sheet's, distributed by the weights of
+    `jaxsimp.bodies.meshes.spring_weights`, so that to first order the sheet's behaviour in its
+    plane does not depend on the resolution of the mesh. On equilateral triangles its Young's
+    modulus times thickness is the sum of both stiffnesses. Out of the plane only bend springs that
+    shorten resist: that is of higher order, and weaker in a finer mesh, as in `cloth`.
 
-    Very unequal or slender triangles ask for a small time step; `jaxsimp.bodies.outlines.remesh`
+    Very unequal or slender triangles need a small time step; `jaxsimp.bodies.outlines.remesh`
     replaces those of a flat mesh.
 
     Args:
         points: shape (V, 3), metres over `scale`, z up.
         faces: point ids of the triangles, shape (F, 3).
-        name: of the kind of body.
+        name: the kind of body.
         scale: metres in one unit of `points`: 0.001 for millimetres.
-        material: of the sheet.
+        material: material of the sheet.
         changes: parameters in which the sheet differs from the material, as `density=0.3`.
 
     Raises:
-        ValueError: if the mesh is refused (see `clean_mesh`), or a number is out of its range.
+        ValueError: if `clean_mesh` refuses the mesh, or a number is out of its range.
         TypeError: if `Material` has no parameter of a name in `changes`.
     """
     material = material.changed(**changes)
@@ -184,7 +183,7 @@ def _weigh(
 ) -> tuple[Material, float]:
     """The material and the mass, kilograms, of a body.
 
-    The extent is its length, metres, or its area, square metres.
+    `extent` is the body's length, metres, or its area, square metres.
     """
     if mass is not None and "density" in changes:
         raise ValueError(
@@ -216,7 +215,7 @@ def _mass_spring(
     mass: float,
     shape: tuple[int, ...],
 ) -> Body:
-    """A body of equal particles, the springs of a family alike."""
+    """A body with equal particles, and equal springs in each family."""
     springs, sizes = np.concatenate(families), [len(pairs) for pairs in families]
     return Body(
         name=name,
@@ -234,12 +233,12 @@ def _mass_spring(
 
 
 def _family_ids(sizes: list[int]) -> Int[np.ndarray, " S"]:
-    """For each spring the index of its family in `FAMILIES`, from the sizes of the families."""
+    """Index of each spring's family in `FAMILIES`, from the sizes of the families."""
     return np.repeat(np.arange(len(FAMILIES)), sizes)
 
 
 def _on_the_table(points: np.ndarray) -> np.ndarray:
-    """Points moved so that the lowest is at z = 0, and the middle of their extent above it."""
+    """Points moved so that the lowest is at z = 0, with their extent centred along x and y."""
     low, high = points.min(axis=0), points.max(axis=0)
     return points - np.array([*(low + high)[:2] / 2, low[2]])
 
@@ -249,7 +248,7 @@ def _pairs(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _grid_springs(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of particles that stretch, shear and bend springs join, shape (_, 2) each."""
+    """Pairs of particles joined by stretch, shear and bend springs, shape (_, 2) each."""
     stretch = [_pairs(grid[:-1], grid[1:]), _pairs(grid[:, :-1], grid[:, 1:])]
     shear = [_pairs(grid[:-1, :-1], grid[1:, 1:]), _pairs(grid[:-1, 1:], grid[1:, :-1])]
     bend = [_pairs(grid[:-2], grid[2:]), _pairs(grid[:, :-2], grid[:, 2:])]
@@ -257,7 +256,7 @@ def _grid_springs(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _grid_faces(grid: np.ndarray) -> np.ndarray:
-    """Two triangles a cell, counter-clockwise seen from above, shape (F, 3)."""
+    """Two triangles per cell, counter-clockwise seen from above, shape (F, 3)."""
     corner, right = grid[:-1, :-1].ravel(), grid[1:, :-1].ravel()
     up, across = grid[:-1, 1:].ravel(), grid[1:, 1:].ravel()
     return np.concatenate(

@@ -1,7 +1,7 @@
 """Garments from their dimensions: towel, T-shirt, trousers and skirt, flat on the table.
 
-Front and back, sewn together and lying on each other, are treated as one sheet of twice the
-fabric: a garment cannot be opened, turned inside out, or moved front against back.
+Front and back, sewn together and lying on each other, are one sheet of twice the fabric: a
+garment cannot open, turn inside out, or move front against back.
 
 Seen from above, x is across the garment and y along it, towards the neck or the waist. The mesh
 is its own mirror image in x. Left is where x < 0.
@@ -22,12 +22,12 @@ from jaxsimp.bodies.outlines import mesh_symmetric_outline
 
 @dataclass(frozen=True, eq=False)
 class Garment:
-    """A body, and where its parts are.
+    """A body with the positions of its parts.
 
     Attributes:
-        body: what is simulated.
+        body: the body to simulate.
         landmarks: particle ids of named points, as `"left_armpit"`.
-        mirror: for each particle the id of its mirror image, shape (N,).
+        mirror: particle id of each particle's mirror image, shape (N,).
     """
 
     body: Body
@@ -43,11 +43,11 @@ def towel(
     Args:
         length: along y, metres.
         width: along x, metres.
-        num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        num_particles: number of particles, met within 10 %.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
-        ValueError: if a dimension is not above zero, or the body is refused.
+        ValueError: if a dimension is not above zero, or another argument is out of range.
     """
     _require(length=length, width=width)
     half = {
@@ -74,24 +74,24 @@ def t_shirt(
     """A T-shirt for a child: 0.5 m long, 0.6 m from cuff to cuff.
 
     Shoulders and sleeves are one straight line that falls from the neck; cuffs are at right
-    angles to it. Landmarks: `neck` (its lowest point), `left_collar` (where neck and shoulder
-    meet), `left_shoulder` (above the armpit), `left_cuff_top`, `left_cuff_bottom`,
-    `left_armpit`, `left_hem`, the same right, and `middle_hem`.
+    angles to it. Landmarks: `neck` (its lowest point), `left_collar` (the corner of neck and
+    shoulder), `left_shoulder` (above the armpit), `left_cuff_top`, `left_cuff_bottom`,
+    `left_armpit`, `left_hem`, the same with `right`, and `middle_hem`.
 
     Args:
         length: along y, from the collar to the hem, metres.
         chest: across the body below the sleeves, metres.
         sleeve_length: along the sleeve's upper side, from above the armpit to the cuff, metres.
-        sleeve_width: of the cuff, metres.
-        neck_width: of the opening, metres.
-        neck_depth: of the opening, metres.
-        slope: of shoulders and sleeves, degrees below the x axis.
-        num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        sleeve_width: width of the cuff, metres.
+        neck_width: width of the neck opening, metres.
+        neck_depth: depth of the neck opening, metres.
+        slope: slope of shoulders and sleeves, degrees below the x axis.
+        num_particles: number of particles, met within 10 %.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, the outline is not that of a T-shirt, or
-            the body is refused.
+            another argument is out of range.
     """
     _require(
         length=length,
@@ -140,20 +140,20 @@ def trousers(
     """Trousers for a child, their legs apart.
 
     Landmarks: `middle_waist`, `crotch`, `left_waist`, `left_cuff_outer`,
-    `left_cuff_inner`, and the same right.
+    `left_cuff_inner`, and the same with `right`.
 
     Args:
         length: along y, from the waist to the cuffs, metres.
         waist: across the top, metres.
         rise: from the waist to the crotch, metres.
         cuff: across the end of a leg, metres.
-        spread: how much farther out than the waist each leg ends, metres; may be below zero.
-        num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        spread: distance of each leg's end beyond the waist, outwards, metres; may be below zero.
+        num_particles: number of particles, met within 10 %.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
         ValueError: if a dimension is not above zero, the outline is not that of trousers, or
-            the body is refused.
+            another argument is out of range.
     """
     _require(length=length, waist=waist, rise=rise, cuff=cuff)
     _require_less("rise", rise, "the length", length)
@@ -178,17 +178,17 @@ def skirt(
 ) -> Garment:
     """A skirt, wider at its hem.
 
-    Landmarks: `left_waist`, `left_hem`, the same right, `middle_waist` and `middle_hem`.
+    Landmarks: `left_waist`, `left_hem`, the same with `right`, `middle_waist` and `middle_hem`.
 
     Args:
         length: along y, metres.
         waist: across the top, metres.
         hem: across the bottom, metres.
-        num_particles: wanted, met within 10 %.
-        options: of `jaxsimp.bodies.from_mesh`; the material is `MATERIALS["garment"]` by default.
+        num_particles: number of particles, met within 10 %.
+        options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
-        ValueError: if a dimension is not above zero, or the body is refused.
+        ValueError: if a dimension is not above zero, or another argument is out of range.
     """
     _require(length=length, waist=waist, hem=hem)
     half = {

@@ -1,7 +1,7 @@
 """Materials: the physical parameters of a body, in one place.
 
-A new parameter of the body is a field of `Material`; if calibrations can fit it and ensembles can
-vary it, its name stands in `PARAMETERS`, too.
+A new parameter of the body is a field of `Material`. Its name is also in `PARAMETERS` if
+calibrations can fit it and ensembles can vary it.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -10,7 +10,7 @@ from types import MappingProxyType
 from jaxsimp.bodies.checks import require_at_least_zero, require_positive
 
 FAMILIES = ("stretch_stiffness", "shear_stiffness", "bend_stiffness")
-"""Families of springs, by the name of their stiffness; `Body.families` has indices in this."""
+"""Families of springs, by the name of their stiffness; `Body.families` holds indices into this."""
 PARAMETERS = ("stiffness", "damping", "drag", "friction")
 """Parameters that calibrations fit and ensembles vary; `stiffness` stands for all `FAMILIES`."""
 FACTORS = ("mass", *PARAMETERS, "thickness")
@@ -20,20 +20,20 @@ GROUPS = MappingProxyType({"mass": ("density",), "stiffness": FAMILIES})
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """The physical parameters of a body, whatever its shape and size.
+    """The physical parameters of a body, independent of its shape and size.
 
     Attributes:
         density: mass of a rope per length, kilograms per metre; mass of a sheet per area,
             kilograms per square metre.
-        stretch_stiffness: newtons per metre. Of a rope or a cloth: of each spring between
-            neighbours. Of a mesh: of the sheet, shared out over the springs along edges.
-        shear_stiffness: newtons per metre, of each spring along a diagonal of a cloth's cell.
-            Ropes and meshes have no such springs, and need 0.
-        bend_stiffness: newtons per metre. Of a rope or a cloth: of each spring between particles
-            two apart. Of a mesh: of the sheet, shared out over the springs across edges.
-        damping: force per rate of elongation, newton-seconds per metre. Of a rope or a cloth: of
-            each spring. Of a mesh: of the sheet, shared out over all springs.
-        drag: rate at which the air slows every particle, per second: dv/dt = -drag v.
+        stretch_stiffness: newtons per metre. Rope or cloth: stiffness of each spring between
+            neighbours. Mesh: stiffness of the sheet, distributed over the springs along edges.
+        shear_stiffness: newtons per metre, stiffness of each spring along a diagonal of a cloth's
+            cell. Ropes and meshes have no such springs, and need 0.
+        bend_stiffness: newtons per metre. Rope or cloth: stiffness of each spring between particles
+            two apart. Mesh: stiffness of the sheet, distributed over the springs across edges.
+        damping: force per rate of elongation, newton-seconds per metre. Rope or cloth: damping of
+            each spring. Mesh: damping of the sheet, distributed over all springs.
+        drag: rate of air drag on every particle, per second: dv/dt = -drag v.
         friction: Coulomb coefficient between the body and the table.
         thickness: metres; a particle rests on the table at half of it.
 
@@ -60,10 +60,10 @@ class Material:
         """The material with other values of some parameters.
 
         Args:
-            values: of parameters by their name, in the units of `Material`.
+            values: values of parameters by their name, in the units of `Material`.
 
         Raises:
-            TypeError: if there is no parameter of such a name.
+            TypeError: if no parameter has a given name.
             ValueError: if a value is out of its range.
         """
         refuse_unknown(values, tuple(field.name for field in fields(self)))
@@ -73,11 +73,11 @@ class Material:
         """The material with some parameters times factors.
 
         Args:
-            factors: by a name in `FACTORS` or `FAMILIES`. `mass` multiplies the density,
+            factors: factors by a name in `FACTORS` or `FAMILIES`. `mass` multiplies the density,
                 `stiffness` the stiffness of each family.
 
         Raises:
-            TypeError: if there is no parameter of such a name.
+            TypeError: if no parameter has a given name.
             ValueError: if a product is out of the parameter's range.
         """
         refuse_unknown(factors, (*FACTORS, *FAMILIES))
@@ -129,4 +129,4 @@ MATERIALS = MappingProxyType(
         "garment": _SHEET.changed(density=0.3),
     }
 )
-"""Default materials. A garment's is two layers of a light cotton."""
+"""Default materials. That of a garment is two layers of light cotton."""

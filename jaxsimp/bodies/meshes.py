@@ -1,8 +1,8 @@
-"""Triangle meshes: read from files, welded, freed of dirt, and checked.
+"""Triangle meshes: read from files, welded, cleaned and checked.
 
-A mesh is two arrays, points of shape (V, 3) and triangles of shape (F, 3). What does no harm is
-mended: coincident points, repeated or empty triangles, points of no triangle, triangles that
-face the wrong way. What would change the meaning of the mesh is refused.
+A mesh is two arrays, points of shape (V, 3) and triangles of shape (F, 3). Harmless faults are
+repaired: coincident points, repeated or empty triangles, points of no triangle, triangles that
+face the wrong way. A fault whose repair would change the surface raises an error.
 """
 
 import warnings
@@ -23,13 +23,13 @@ from jaxsimp.bodies.topology import (
 
 Points = Float[np.ndarray, "V 3"]
 Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
-"""Points and triangles of a mesh that a function makes."""
+"""Points and triangles of a mesh that a function returns."""
 
 WELD = 1e-5
-"""Points closer than this, relative to the largest extent, are one point; a triangle that is
-lower than this is empty. Above the rounding of a float32 file, below any triangle of a cloth."""
+"""Distance, relative to the largest extent, below which points are one point, and height below
+which a triangle is empty. Above the rounding of a float32 file, below any triangle of a cloth."""
 SMALLEST, LARGEST = 0.02, 5.0
-"""Largest extent that a body can have, metres."""
+"""Limits of a body's largest extent, metres."""
 UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254))
 
 
@@ -37,7 +37,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> Mesh:
     """A clean mesh from a file: `read_mesh`, then `clean_mesh`.
 
     Args:
-        path: of an OBJ, PLY, STL, OFF or GLB file, or another format that trimesh reads.
+        path: an OBJ, PLY, STL, OFF or GLB file, or another format that trimesh reads.
         scale: metres in one unit of the file: 0.001 for millimetres.
 
     Raises:
@@ -51,13 +51,12 @@ def load_mesh(path: str | Path, *, scale: float = 1.0) -> Mesh:
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Points and triangles as a file has them: in its order and unit, unwelded, unchecked.
+    """Points and triangles of a file: in its order and unit, unwelded, unchecked.
 
-    Polygons are cut into triangles, and the parts of a scene are put together. Axes are taken
-    as they are, z up.
+    Splits polygons into triangles, and joins the parts of a scene. Axes stay unchanged, z up.
 
     Args:
-        path: of an OBJ, PLY, STL, OFF or GLB file, or another format that trimesh reads.
+        path: an OBJ, PLY, STL, OFF or GLB file, or another format that trimesh reads.
 
     Raises:
         ValueError: if the file cannot be read, or has no triangles.
@@ -74,7 +73,7 @@ def read_mesh(path: str | Path) -> Mesh:
             faces = np.array(mesh.faces, dtype=np.int64)
         if faces.size:
             _check_shapes(points, faces)
-    except Exception as error:  # the readers raise whatever a broken file makes of them
+    except Exception as error:  # the readers raise many kinds of errors on a broken file
         raise ValueError(
             f"{path} cannot be read as a mesh ({type(error).__name__}: {error}); "
             f"give an OBJ, PLY, STL, OFF or GLB file"
@@ -85,12 +84,12 @@ def read_mesh(path: str | Path) -> Mesh:
 
 
 def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
-    """One orientable surface in metres, from a mesh that may be dirty.
+    """One orientable surface in metres, from a mesh that may have faults.
 
-    Mended: points that coincide (see `WELD`) become the first of them; triangles that are
-    empty or there twice, and points of no triangle, are left out; triangles are turned to face
-    the same way as the first. An empty triangle that fills a gap between three others stays.
-    The order of what is kept does not change: a clean mesh comes back as it was.
+    Repairs: points that coincide (see `WELD`) become the first of them; empty or repeated
+    triangles, and points of no triangle, are removed; triangles are turned to face the same way
+    as the first. An empty triangle that fills a gap between three others stays. The order of
+    points and triangles does not change, and a clean mesh stays unchanged.
 
     Args:
         points: shape (V, 3).
@@ -98,9 +97,9 @@ def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
         scale: metres in one unit of `points`.
 
     Raises:
-        ValueError: if ids or coordinates are wrong, no triangle is left, the size is not that
-            of a body, an edge has more than two triangles, the mesh is in several pieces, or
-            it has one side only.
+        ValueError: if ids or coordinates are invalid, no triangle remains, the extent is outside
+            `SMALLEST` to `LARGEST`, an edge has more than two triangles, the mesh is in several
+            pieces, or it has one side only.
     """
     if not 0 < scale < np.inf:
         raise ValueError(f"scale is {scale}; give the metres in one unit of the mesh")
@@ -133,26 +132,26 @@ def spring_weights(
 
     A spring's weight is the area of its triangles over its squared length, as in A. Van Gelder,
     "Approximate simulation of elastic membranes by triangulated spring meshes" (1998). A spring
-    of stiffness `k weight` then has the energy of its strain times its area: what the sheet
-    does depends on `k`, and not on how finely it is meshed. On equilateral triangles the sheet
-    has Young's modulus times thickness `k`, in newtons per metre, and Poisson's ratio 1/3; equal
-    stretch in all directions is right on any triangles.
+    of stiffness `k weight` then has the energy of its strain times its area: the sheet's behaviour
+    depends on `k`, and not on the resolution of the mesh. On equilateral triangles the sheet has
+    Young's modulus times thickness `k`, in newtons per metre, and Poisson's ratio 1/3; equal
+    stretch in all directions is exact on any triangles.
 
-    Across an edge the length is that of the two triangles laid flat, so that triangles folded
-    on each other at rest do not make a spring of any stiffness. Pairs that an edge joins
-    already are left out; a pair across two edges has the sum of both weights.
+    Across an edge the length is that of the two triangles laid flat, so that the stiffness stays
+    bounded where triangles are folded onto each other at rest. Pairs that an edge already joins
+    are omitted; a pair across two edges has the sum of both weights.
 
     Args:
-        points: at rest, shape (V, 3), metres.
-        faces: a clean mesh.
+        points: rest coordinates, shape (V, 3), metres.
+        faces: triangles of a clean mesh, shape (F, 3).
 
     Returns:
-        Pairs of point ids, first the lower, and their weights: of the edges, then across them.
+        Pairs of point ids, the lower first, and their weights: along edges, then across them.
     """
     pairs, where, count = distinct_edges(half_edges(faces)[0])
     total = np.bincount(where, weights=np.tile(face_areas(points, faces), 3))
     length = _lengths(points, pairs)
-    ends = np.sort(inner_edges(faces)[1], axis=1)  # in the order of `pairs`, as all here
+    ends = np.sort(inner_edges(faces)[1], axis=1)  # in the order of `pairs`, as all arrays here
     inner = count == 2
     heights = 2 * total[inner] / length[inner]
     weight = total[inner] / np.maximum(_lengths(points, ends), heights) ** 2
@@ -214,10 +213,10 @@ def _check_coordinates(points: np.ndarray) -> None:
 
 
 def _weld(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """For each point the id of the first that it is one with, shape (V,)."""
+    """Id of the first point that each point coincides with, shape (V,)."""
     from scipy.spatial import cKDTree
 
-    # Exact copies first: what is left has few pairs even where many points coincide.
+    # Exact copies first: the remaining points have few pairs even where many points coincide.
     distinct, where = np.unique(points, axis=0, return_inverse=True)
     near = cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
     group = connected_pieces(near, len(distinct))[1][where.ravel()]
@@ -226,7 +225,7 @@ def _weld(points: np.ndarray, tolerance: float) -> np.ndarray:
 
 
 def _without_dirt(points: np.ndarray, faces: np.ndarray, tolerance: float) -> np.ndarray:
-    """Triangles of three points, each once, and not lower than the tolerance."""
+    """Triangles of three different points, without repeated or empty ones."""
     faces = faces[(np.diff(np.sort(faces, axis=1), axis=1) > 0).all(axis=1)]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     faces = faces[np.sort(first)]
@@ -238,7 +237,7 @@ def _without_dirt(points: np.ndarray, faces: np.ndarray, tolerance: float) -> np
         fills = (count[where].reshape(3, -1) == 2).all(axis=0)
         if not (empty & ~fills).any():
             break
-        faces = faces[~empty | fills]  # which may leave another without its neighbour
+        faces = faces[~empty | fills]  # this may leave another triangle without its neighbour
     return faces
 
 
@@ -265,8 +264,8 @@ def _check_edges(points: np.ndarray, faces: np.ndarray) -> None:
 def _oriented(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The triangles, turned where needed to face the same way as the first.
 
-    Each triangle is two nodes of a graph: as it is, and turned. Neighbours that run along their
-    edge in opposite directions agree as they are, the others when one is turned.
+    Each triangle is two nodes of a graph: unchanged, and turned. Neighbours that run along their
+    edge in opposite directions agree unchanged, the others after one is turned.
     """
     count = len(faces)
     edges, rows = half_edges(faces)[0], shared_half_edges(faces)

@@ -1,7 +1,7 @@
-"""Outlines filled with triangles: a polygon to an even mesh of a wanted number of points.
+"""Outlines filled with triangles: a polygon to an even mesh with a given number of points.
 
-Points lie evenly on the sides and on a hexagonal lattice inside, and are joined by Delaunay's
-triangulation. (Smoothing was tried: it made no angle larger.) Nothing is random.
+Points lie evenly on the sides and on a hexagonal lattice inside, joined by Delaunay's
+triangulation. The result is deterministic. (Smoothing made no angle larger.)
 """
 
 import numpy as np
@@ -13,10 +13,10 @@ from jaxsimp.bodies.topology import Faces, boundary_edges, boundary_loops, disti
 Corners = Float[np.ndarray, "C 2"]
 
 COUNT_TOLERANCE = 0.1
-"""Relative difference allowed between the number of points wanted and made."""
-CLEARANCE = 0.6  # of the spacing, between the lattice and the outline
-TURN = np.deg2rad(20.0)  # of a boundary, above which a point is a corner
-FLAT = 1e-3  # height of a flat mesh, relative to its extent
+"""Largest relative difference between the requested and the actual number of points."""
+CLEARANCE = 0.6  # distance between lattice and outline, as a fraction of the spacing
+TURN = np.deg2rad(20.0)  # turn of a boundary above which a point is a corner
+FLAT = 1e-3  # largest height of a flat mesh, relative to its extent
 
 
 def mesh_outline(corners: Corners, num_points: int) -> Mesh:
@@ -26,8 +26,9 @@ def mesh_outline(corners: Corners, num_points: int) -> Mesh:
     evenly.
 
     Args:
-        corners: of the outline in order, either way round, shape (C, 2), C at least 3, metres.
-        num_points: number of points wanted, met within `COUNT_TOLERANCE`.
+        corners: corners of the outline in order, in either direction, shape (C, 2), C at least 3,
+            metres.
+        num_points: number of points, met within `COUNT_TOLERANCE`.
 
     Raises:
         ValueError: if the outline crosses or touches itself or encloses nothing, or has parts
@@ -40,21 +41,21 @@ def mesh_outline(corners: Corners, num_points: int) -> Mesh:
 def mesh_symmetric_outline(
     half: Corners, num_points: int
 ) -> tuple[Points, Faces, Int[np.ndarray, " V"]]:
-    """A polygon that is its own mirror image in x, filled with triangles that are too.
+    """A mesh that is its own mirror image in x, from one half of its outline.
 
     The half with x >= 0 is meshed as by `mesh_outline`, its corners first, and mirrored: each
-    point has the same coordinates as its mirror image, but for the sign of x, bit for bit.
+    point has bitwise the same coordinates as its mirror image, except for the sign of x.
 
     Args:
         half: corners of the half, from one end of its middle line, where x = 0, to the other,
             with x > 0 between, shape (C, 2), C at least 3, metres.
-        num_points: of the whole mesh, met within `COUNT_TOLERANCE`.
+        num_points: number of points of the whole mesh, met within `COUNT_TOLERANCE`.
 
     Returns:
-        Points, triangles, and the id of the mirror image of each point, itself on the line.
+        Points, triangles, and the id of each point's mirror image; on the line its own id.
 
     Raises:
-        ValueError: as `mesh_outline`, or if only the ends must be, and are not, on the line.
+        ValueError: as `mesh_outline`, or if the x of a corner is not as stated for `half`.
     """
     on_line = half[:, 0] == 0
     if not (on_line[0] and on_line[-1]) or on_line[1:-1].any() or (half[:, 0] < 0).any():
@@ -77,19 +78,19 @@ def mesh_symmetric_outline(
 
 
 def remesh(points: Points, faces: Faces, num_points: int) -> Mesh:
-    """A flat mesh meshed anew, with a wanted number of points, horizontal, facing up.
+    """A flat mesh meshed again, with a given number of points, horizontal, facing up.
 
-    The outline keeps its corners, where it turns by more than 20 degrees; between them it is
-    followed within a thousandth of its extent.
+    The outline keeps its corners, where it turns by more than 20 degrees; between them the new
+    outline follows it within a thousandth of its extent.
 
     Args:
         points: shape (V, 3), metres.
         faces: point ids of the triangles, shape (F, 3).
-        num_points: number of points wanted, met within `COUNT_TOLERANCE`.
+        num_points: number of points, met within `COUNT_TOLERANCE`.
 
     Raises:
-        ValueError: if `clean_mesh` refuses the mesh, or it is not flat, overlaps itself or has
-            holes, or its outline is refused by `mesh_outline`.
+        ValueError: if `clean_mesh` refuses the mesh, if it is not flat, overlaps itself or has
+            holes, or if `mesh_outline` refuses its outline.
     """
     points, faces = clean_mesh(points, faces)
     flat = _laid_flat(points)
@@ -127,7 +128,7 @@ def check_outline(corners: Corners) -> Corners:
         raise ValueError(f"corner {twice[0]} is there twice in a row; leave one out")
     starts, ends = corners, np.roll(corners, -1, axis=0)
     for side, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        # Neither the side before nor the one after may come back to this one but at the corner.
+        # The side before and the one after may touch this one only at the corner.
         others = np.delete(np.arange(len(corners)), [side - 1, side, (side + 1) % len(corners)])
         far = np.concatenate([corners[others], starts[[side - 1]], ends[[(side + 1) % len(ends)]]])
         touched = _distances(far, start[None], end[None]).min() <= 1e-9 * size
@@ -142,9 +143,9 @@ def check_outline(corners: Corners) -> Corners:
 
 
 def _fill(corners: np.ndarray, num_points: int, *, mirrored: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Points on the sides, a row a point with its side's start first, and points inside.
+    """Points on the sides, from the start of each side, and points inside, shape (_, 2) each.
 
-    Their number, counted with the mirror images of those off x = 0 if `mirrored`, is that wanted.
+    If `mirrored`, `num_points` includes the mirror images of the points off x = 0.
     """
     if num_points < 3:
         raise ValueError(f"{num_points} points are asked for; at least 3 are needed")
@@ -161,7 +162,7 @@ def _fill(corners: np.ndarray, num_points: int, *, mirrored: bool) -> tuple[np.n
         count -= int((sides[:, 0] == 0).sum()) if mirrored else 0
         if abs(count - num_points) < miss:
             best, miss, found = (sides, inside), abs(count - num_points), count
-        spacing *= (count / num_points) ** 0.4  # less than 1/2, which overshoots
+        spacing *= (count / num_points) ** 0.4  # below 1/2, which overshoots
     if best is None or miss > COUNT_TOLERANCE * num_points:
         raise ValueError(
             f"{num_points} points are asked for; this outline is met with {found}: ask for that, "
@@ -197,7 +198,7 @@ def _lattice(corners: np.ndarray, spacing: float) -> np.ndarray:
 def _triangulate(
     corners: np.ndarray, sides: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Delaunay's triangulation of an outline and the points in it; corners first."""
+    """Delaunay's triangulation of an outline and its inner points; corners first."""
     is_corner = (sides[:, None] == corners[None]).all(axis=2).any(axis=1)
     order = np.argsort(~is_corner, kind="stable")
     ring = np.argsort(order)  # ids of the points along the outline
@@ -221,13 +222,13 @@ def _delaunay(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     a, b, c = points[faces].transpose(1, 0, 2)
     area = _cross_product(b - a, c - a) / 2
     faces = np.where((area < 0)[:, None], faces[:, ::-1], faces)
-    # Points on a side may leave triangles that only rounding keeps from being empty.
+    # Points on a side may leave triangles that are empty up to rounding.
     whole = np.abs(area) > 1e-9 * np.ptp(corners, axis=0).max() ** 2
     return faces[whole & _inside((a + b + c) / 3, corners)]
 
 
 def _laid_flat(points: np.ndarray) -> np.ndarray:
-    """A flat mesh turned by the least angle to be horizontal, shape (V, 2)."""
+    """A flat mesh turned to horizontal by the least angle, shape (V, 2)."""
     centred = points - points.mean(axis=0)
     normal = np.linalg.svd(centred, full_matrices=False)[2][2]
     height, extent = np.ptp(centred @ normal), np.ptp(points, axis=0).max()
@@ -237,15 +238,15 @@ def _laid_flat(points: np.ndarray) -> np.ndarray:
             f"anew: decimate or subdivide it in a mesh editor"
         )
     leading = normal[::-1][np.flatnonzero(np.abs(normal[::-1]) > 1e-9)[0]]
-    normal = normal * np.sign(leading)  # up, or else along y or x
+    normal = normal * np.sign(leading)  # up, otherwise along y or x
     axis = np.cross(normal, [0.0, 0.0, 1.0])
-    cross = np.cross(np.eye(3), axis)  # of which the rows are e x axis
+    cross = np.cross(np.eye(3), axis)  # its rows are e x axis
     turn = np.eye(3) + cross + cross @ cross / (1 + normal[2])
     return (centred @ turn.T)[:, :2]
 
 
 def _simplified(outline: np.ndarray) -> np.ndarray:
-    """Corners of an outline, and as many more points as follow it closely."""
+    """Corners of an outline, and the further points needed to follow it closely."""
     along = np.roll(outline, -1, axis=0) - outline
     before = np.roll(along, 1, axis=0)
     angle = np.arctan2(_cross_product(before, along), np.sum(before * along, axis=1))
@@ -290,7 +291,7 @@ def _cross_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _cross(start: np.ndarray, end: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Whether a segment crosses others, each from one side to the other."""
+    """Whether a segment crosses each of some others, from one side to the other."""
     sides = [_cross_product(end - start, points - start) for points in (starts, ends)]
     own = [_cross_product(ends - starts, point - starts) for point in (start, end)]
     return (sides[0] * sides[1] < 0) & (own[0] * own[1] < 0)
@@ -309,6 +310,6 @@ def _inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     (x0, y0), (x1, y1) = corners.T, np.roll(corners, -1, axis=0).T
     x, y = points.T[:, :, None]
     crosses = (y0 > y) != (y1 > y)
-    # The point is to the left of the crossing, without a division by the side's rise.
+    # Whether the point is left of the crossing, without a division by the side's rise.
     before = ((y - y0) * (x1 - x0) > (x - x0) * (y1 - y0)) == (y1 > y0)
     return (crosses & before).sum(axis=1) % 2 == 1

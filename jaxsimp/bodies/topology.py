@@ -1,7 +1,7 @@
 """Topology: edges, rims, pieces and neighbours of triangle meshes and of springs.
 
-A mesh is given by its triangles, an array of point ids of shape (F, 3); springs and edges are pairs
-of ids, shape (E, 2). Coordinates play no part.
+A mesh is an array of the point ids of its triangles, shape (F, 3); springs and edges are pairs of
+ids, shape (E, 2). Coordinates are not used.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ Pairs = Int[np.ndarray, "_ 2"]
 
 
 def half_edges(faces: Faces) -> tuple[Int[np.ndarray, "3*F 2"], Int[np.ndarray, " 3*F"]]:
-    """Edges of each triangle, directed as in it, and the corners opposite to them.
+    """Edges of each triangle, in the triangle's direction, and the corners opposite to them.
 
     Rows `i`, `F + i` and `2 F + i` belong to triangle `i`.
 
@@ -24,10 +24,10 @@ def half_edges(faces: Faces) -> tuple[Int[np.ndarray, "3*F 2"], Int[np.ndarray, 
 
 
 def distinct_edges(edges: Pairs) -> tuple[Pairs, Int[np.ndarray, " _"], Int[np.ndarray, " _"]]:
-    """Edges without their direction: each once, its place for every row, its number of rows.
+    """Edges without direction: each once, with the index for every row and the number of rows.
 
     Args:
-        edges: pairs of point ids, shape (H, 2); a pair may occur several times, either way round.
+        edges: pairs of point ids, shape (H, 2); a pair may occur several times, in any direction.
 
     Returns:
         The E different pairs, lower id first, in ascending order, shape (E, 2); for each row of
@@ -40,7 +40,7 @@ def distinct_edges(edges: Pairs) -> tuple[Pairs, Int[np.ndarray, " _"], Int[np.n
 
 
 def boundary_edges(faces: Faces) -> tuple[Pairs, Int[np.ndarray, " _"]]:
-    """Edges of one triangle only, directed as in it, and that triangle.
+    """Edges of one triangle only, in its direction, and that triangle.
 
     Args:
         faces: point ids of the triangles, shape (F, 3).
@@ -55,13 +55,13 @@ def boundary_edges(faces: Faces) -> tuple[Pairs, Int[np.ndarray, " _"]]:
 
 
 def shared_half_edges(faces: Faces) -> Pairs:
-    """For each edge of exactly two triangles its two rows in `half_edges`, ascending, shape (E, 2).
+    """The two rows in `half_edges` of each edge of exactly two triangles, ascending, shape (E, 2).
 
     Args:
         faces: point ids of the triangles, shape (F, 3).
     """
     _, where, count = distinct_edges(half_edges(faces)[0])
-    # In the order of their edges: the two rows of an edge of two triangles are neighbours.
+    # In the order of edges: the two rows of an edge of two triangles are adjacent.
     order = np.argsort(where, kind="stable")
     return order[np.repeat(count == 2, count)].reshape(-1, 2)
 
@@ -69,7 +69,7 @@ def shared_half_edges(faces: Faces) -> Pairs:
 def inner_edges(faces: Faces) -> tuple[Pairs, Pairs, Pairs]:
     """Edges of two triangles, the points opposite to them, and the triangles, shape (E, 2) each.
 
-    An edge is directed as in its first triangle, the one with the lower row in `half_edges`.
+    An edge has the direction of its first triangle, the one with the lower row in `half_edges`.
 
     Args:
         faces: point ids of the triangles, shape (F, 3).
@@ -103,9 +103,9 @@ def boundary_loops(faces: Faces) -> list[list[int]]:
 
 
 def rim(faces: Faces, num_points: int) -> Int[np.ndarray, "N 2"]:
-    """The two neighbours of each point along the boundary, shape (N, 2); -1 for a point inside it.
+    """The two neighbours of each point along the boundary, shape (N, 2); -1 for inner points.
 
-    Where boundaries touch, a point has more than two: these are its lowest and its highest.
+    Where boundaries touch, a point has more than two neighbours: these are the lowest and highest.
 
     Args:
         faces: point ids of the triangles, shape (F, 3).
@@ -115,14 +115,14 @@ def rim(faces: Faces, num_points: int) -> Int[np.ndarray, "N 2"]:
     both = np.concatenate([edges, edges[:, ::-1]])
     both = both[np.lexsort(both.T[::-1])]
     found = np.full((num_points, 2), -1)
-    # Written forwards the last neighbour stays, backwards the first.
+    # Assignment in forward order keeps the last neighbour, in backward order the first.
     found[both[:, 0], 1] = both[:, 1]
     found[both[::-1, 0], 0] = both[::-1, 1]
     return found
 
 
 def chain(num_points: int, apart: int = 1) -> Pairs:
-    """Pairs of points that are `apart` places from each other in a line, lower id first.
+    """Pairs of points at a distance of `apart` places in a line, lower id first.
 
     Args:
         num_points: number of points in the line.
@@ -135,10 +135,10 @@ def chain(num_points: int, apart: int = 1) -> Pairs:
 def neighbours(
     pairs: Pairs, num_points: int
 ) -> tuple[Int[np.ndarray, " _"], Int[np.ndarray, " _"]]:
-    """Points that pairs join to each point.
+    """The neighbours of each point, joined to it by pairs.
 
     Args:
-        pairs: point ids, shape (E, 2); a pair may occur several times, either way round.
+        pairs: point ids, shape (E, 2); a pair may occur several times, in any direction.
         num_points: number of points, N.
 
     Returns:
@@ -151,7 +151,7 @@ def neighbours(
 
 
 def connected_pieces(pairs: Pairs, num_points: int) -> tuple[int, Int[np.ndarray, " N"]]:
-    """Number of pieces that pairs join points to, and the piece of each point, counted from 0.
+    """Number of connected pieces, and the piece of each point, counted from 0.
 
     Args:
         pairs: point ids, shape (E, 2).
@@ -167,7 +167,7 @@ def connected_pieces(pairs: Pairs, num_points: int) -> tuple[int, Int[np.ndarray
 
 
 def are_among(pairs: Pairs, edges: Pairs) -> Bool[np.ndarray, " _"]:
-    """Whether each pair is one of the edges, either way round, shape (len(pairs),).
+    """Whether each pair is one of the edges, in either direction, shape (len(pairs),).
 
     Args:
         pairs: point ids, shape (P, 2).

@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: what follows the command's name; those of the process by default.
+        arguments: arguments after the command's name; those of the process by default.
 
     Returns:
         The exit status: that of the verb, 2 for wrong input, 130 for Ctrl-C.
@@ -38,13 +38,13 @@ def parse(arguments: Sequence[str]) -> Any:
     """The options of the verb that the command line names.
 
     Raises:
-        SystemExit: if they are wrong (status 2), or help is asked for (status 0).
+        SystemExit: if they are invalid (status 2), or request help (status 0).
     """
     app = tyro.extras.SubcommandApp()
     named = bool(arguments) and arguments[0] in VERBS
     for verb in VERBS:
         options = import_module(f"jaxsimp.cli.{verb}").Options
-        # In the list of verbs one line stands for each.
+        # The list of verbs shows only the first line of each description.
         told = None if named else (options.__doc__ or "").partition("\n")[0]
         app.command(options, name=verb, help=told)
     return app.cli(prog="jaxsimp", description=DESCRIPTION, args=arguments)

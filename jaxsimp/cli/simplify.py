@@ -1,6 +1,6 @@
 """The verb `simplify`: key points of goals in files.
 
-Rooms are loaded by the face when they are used, so that `jaxsimp --help` waits for none of them.
+The face loads each room at first use, so that `jaxsimp --help` imports none of them.
 """
 
 import math
@@ -21,25 +21,25 @@ NO_MODEL = 1
 """Exit status if some goal has no model within the tolerance and the workspace."""
 PICTURES = (".jpg", ".pdf", ".png", ".svg")
 MOST_PICTURED = 40
-"""Most goals in one picture: matplotlib draws up to 65,536 pixels, 500 of them a goal."""
+"""Largest number of goals in one picture: matplotlib draws up to 65,536 pixels, 500 per goal."""
 XYZ = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Options:
-    """Key points of goals in files: the particles that are worth grasping to reach them.
+    """Key points of goals in files: the particles to grasp to reach them.
 
     A goal is an .npz file with `positions` (N x 3, metres, z up, the table at z = 0). It may
     define its body: by `rest` (N x 2 or N x 3) and `faces` (F x 3) a sheet, without faces a
-    rope. Without rest coordinates a rope is straight at rest, and a sheet is flat, its
-    triangles laid out as large as they are in the goal: right to about 1 % where creases
-    lie along edges of the triangles, otherwise short by up to a triangle at each crease.
+    rope. Without rest coordinates a rope is straight at rest, and a sheet is flat, with the
+    edge lengths of the goal: accurate to about 1 % where creases lie along edges of the
+    triangles, otherwise too short by up to a triangle at each crease.
 
     With --body a goal may also be a mesh file, whose points are the body's, in its order.
     Goals of one body are one batch: give --body, or the same rest and faces.
 
-    Models of ropes keep to a workspace: --lower, --upper, --above-table, --fixed-ends and
-    --max-stretch. A goal that has no model within it has the status INFEASIBLE.
+    --lower, --upper, --above-table, --fixed-ends and --max-stretch limit the models of ropes
+    to a workspace. A goal that has no model within it has the status INFEASIBLE.
 
     The exit status is 0, 1 if a goal has no model within the tolerance and the workspace, 2 for
     wrong input.
@@ -51,7 +51,7 @@ class Options:
     """The body at rest: a mesh (OBJ, PLY, STL, OFF, GLB, ...) in metres, or an .npz file with
     rest, and with faces if it is a sheet."""
     method: str = "robust"
-    """How: robust, paper (section III-A), or meshlab (the paper's own tool, an extra)."""
+    """Method: robust, paper (section III-A), or meshlab (the paper's tool, an optional extra)."""
     tolerance: float | None = None
     """Error below which a model fits, metres; the method's own by default."""
     lower: Annotated[XYZ | None, tyro.conf.arg(metavar="X Y Z")] = None
@@ -59,7 +59,7 @@ class Options:
     upper: Annotated[XYZ | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Highest x, y and z of a rope's model, metres; inf for no limit."""
     above_table: bool = False
-    """Keep a rope's model the rope's radius above the table at z = 0."""
+    """Keep a rope's model at least the rope's radius above the table at z = 0."""
     fixed_ends: bool = False
     """Keep the ends of a rope's model at the ends of the goal."""
     max_stretch: float | None = None
@@ -71,11 +71,11 @@ class Options:
     """Picture (PNG, PDF, SVG, JPG) of the goals with their models and errors by size."""
 
     def check(self) -> None:
-        """Refuse what cannot be done, before anything is run.
+        """Check the options before any computation.
 
         Raises:
-            ValueError: if there is no goal or no such method, the tolerance is not above zero,
-                the workspace is none, or a path cannot be written to or is that of another file.
+            ValueError: if there is no goal, the method is unknown, the tolerance is not above
+                zero, the workspace is invalid, or a path is not writable or is another file's.
         """
         if not self.goals:
             raise ValueError("no goal is given; name at least one file")
@@ -100,7 +100,7 @@ class Options:
             _check_figure(self.figure, len(self.goals))
 
     def workspace(self) -> "jaxsimp.Workspace | None":
-        """The workspace that the options give; None if they give none.
+        """The workspace that the options define; None without such options.
 
         Raises:
             ValueError: if a bound or `max_stretch` is out of its range.
@@ -116,18 +116,18 @@ class Options:
         return jaxsimp.Workspace(**limits) if limits else None
 
     def run(self) -> int:
-        """Simplify the goals, print a table, and write what was asked for.
+        """Simplify the goals, print a table, and write the requested files.
 
         Returns:
             The exit status: 0, or `NO_MODEL`.
 
         Raises:
-            ValueError: if a file or an option is refused; nothing is written then.
+            ValueError: if a file or an option is invalid; nothing is written then.
             OSError: if a file cannot be written.
         """
         self.check()
         models = simplified(self)
-        console = Console(width=None if sys.stdout.isatty() else 160)  # a file has no width
+        console = Console(width=None if sys.stdout.isatty() else 160)  # fixed width for a file
         console.print(table(models))
         if self.json:
             rows = [row(model, self.method) for model in models]
@@ -150,14 +150,14 @@ def _check_figure(path: Path, num_goals: int) -> None:
 
 @dataclass(frozen=True)
 class SimplifiedGoal:
-    """A goal and what it was simplified to.
+    """A goal and its model.
 
     Attributes:
-        path: of the goal's file.
-        body: what the goal is for.
+        path: path of the goal's file.
+        body: body of the goal.
         goal: shape (N, 3), metres.
         key_points: the model.
-        seconds: that it took, its share of a batch.
+        seconds: computing time, seconds; that of a batch over its number of goals.
     """
 
     path: Path
@@ -168,16 +168,16 @@ class SimplifiedGoal:
 
 
 def simplified(options: Options) -> list[SimplifiedGoal]:
-    """Models of all goals in their order, found in a batch for each body.
+    """Models of all goals in their order, computed in one batch per body.
 
     Raises:
-        ValueError: if a file or an option is refused.
+        ValueError: if a file or an option is invalid.
     """
     from jaxsimp.goals import load_body, load_goal
 
     body = load_body(options.body) if options.body else None
     loaded = [load_goal(path, body) for path in options.goals]
-    # Files that define their bodies alike are goals of one body.
+    # Files with equal body definitions are goals of one body.
     batches: dict[tuple[bytes, bytes], list[int]] = {}
     for index, (made, _) in enumerate(loaded):
         batches.setdefault((made.rest.tobytes(), made.faces.tobytes()), []).append(index)
@@ -238,12 +238,12 @@ def row(model: SimplifiedGoal, method: str) -> dict[str, Any]:
 
 
 def _number(error: float) -> float | None:
-    """An error as JSON, which has no infinity: there is no model of that size."""
+    """An error as JSON: None for infinity, where there is no model of that size."""
     return float(error) if math.isfinite(error) else None
 
 
 def table(models: list[SimplifiedGoal]) -> Table:
-    """Models for people, a line each."""
+    """A table of the models for the terminal, one line each."""
     made = Table(title="key points", title_justify="left")
     made.add_column("goal", overflow="fold")
     for heading in ("status", "key points", "particles", "tolerance (mm)"):
@@ -267,12 +267,12 @@ def table(models: list[SimplifiedGoal]) -> Table:
 
 
 def save_figure(models: list[SimplifiedGoal], path: Path) -> None:
-    """A picture of the goals with their models and errors, a row a goal."""
+    """Save a picture of the goals with their models and errors, one row per goal."""
     import matplotlib.pyplot as plt
 
     stems = [model.path.stem for model in models]
     shown = {
-        # The whole path where files of several folders have the same name.
+        # The whole path if files of several folders have the same name.
         stem if stems.count(stem) == 1 else str(model.path): (
             model.body,
             model.goal,

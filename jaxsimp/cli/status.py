@@ -7,16 +7,16 @@ from rich.console import Console
 REFUSED = 2
 """Exit status for wrong input."""
 INTERRUPTED = 130
-"""Exit status of a program that Ctrl-C ended, as shells have it."""
+"""Exit status of a program ended by Ctrl-C, as in shells."""
 
 
 def exit_status(run: Callable[[], int], interrupted: str = "interrupted") -> int:
-    """Run a command, and turn what stops it into an exit status.
+    """Run a command, and turn errors and Ctrl-C into an exit status.
 
     Args:
         run: the command; returns its own exit status. A `ValueError` or an `OSError` that it
             raises is printed to the standard error stream, in one line.
-        interrupted: what is printed after Ctrl-C.
+        interrupted: text to print after Ctrl-C.
     """
     try:
         return run()

@@ -1,8 +1,8 @@
-"""Goals: where every particle of a body should end.
+"""Goals: the final position of every particle of a body.
 
 A goal is an array of positions, shape (N, 3), metres, z up, the table at z = 0. The functions
-here make goals of ropes, cloths and garments; `check_goal` is the door through which any other
-goal enters, `load_goal` the one for goals in files.
+here make goals of ropes, cloths and garments; `check_goal` checks any other goal, and `load_goal`
+reads and checks a goal in a file.
 """
 
 from jaxsimp.goals.check import as_goal, check_goal

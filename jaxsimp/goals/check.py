@@ -1,4 +1,4 @@
-"""The doors for goals: a cheap one for arrays, and a strict one for goals that users state."""
+"""Checks of goals: `as_goal`, a cheap one for arrays, and `check_goal`, a strict one for users."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -7,9 +7,9 @@ from jaxsimp.bodies import Body
 from jaxsimp.goals.shapes import Positions
 
 NOISE = 0.03
-"""Allowance for noise, relative to the body's size: a goal that was measured has some."""
+"""Allowance for noise in a measured goal, relative to the body's size."""
 MAX_STRETCH = 1.2
-"""A goal may stretch the body by this ratio, as far as pickers may (SoftGym's rule)."""
+"""Largest stretch of the body in a goal, as a ratio; that of pickers (SoftGym's rule)."""
 SPAN = 0.2
 """Distance at rest, relative to the body's size, above which pairs of particles are compared."""
 MOST_SOURCES = 64
@@ -37,18 +37,18 @@ def as_goal(body: Body, goal: Positions) -> Positions:
 
 
 def check_goal(body: Body, goal: Positions) -> Positions:
-    """The goal as a float array, if the body can be there.
+    """The goal as a float array, if the body can reach it.
 
-    No particle may be farther under the table than noise puts it (`NOISE` of the body's size).
-    The body may not be stretched beyond `MAX_STRETCH`. Springs are too short to tell stretch
-    from noise, so it is pairs of particles some way apart that are compared (`SPAN` of the
-    body's size, along its springs at rest): their straight distance in the goal may be
-    `MAX_STRETCH` times their distance along the springs, and noise more. One of each pair is of
-    up to `MOST_SOURCES` particles spread over the body.
+    No particle may be farther under the table than the noise (`NOISE` times the body's size). The
+    body may not be stretched beyond `MAX_STRETCH`. A single spring is too short to distinguish
+    stretch from noise, so the check compares pairs of particles at least `SPAN` times the body's
+    size apart, along its springs at rest: their straight distance in the goal may be `MAX_STRETCH`
+    times their distance along the springs, plus the noise. One particle of each pair is among up
+    to `MOST_SOURCES` particles spread over the body.
 
     Raises:
         ValueError: if the shape is not (N, 3), a coordinate is not finite, a particle is under
-            the table, or the body is stretched beyond what it can be.
+            the table, or the body is stretched too far.
     """
     goal = as_goal(body, goal)
     lowest = int(goal[:, 2].argmin())
@@ -63,12 +63,12 @@ def check_goal(body: Body, goal: Positions) -> Positions:
 
 
 def _check_stretch(body: Body, goal: np.ndarray) -> None:
-    """Refuse a goal in which particles are farther apart than the body reaches."""
+    """Raise a `ValueError` for a goal with particles farther apart than the body is long."""
     count = body.num_particles
     sources = np.unique(np.linspace(0, count - 1, min(count, MOST_SOURCES)).round().astype(int))
     reach = _distances_along(body, sources)
     apart = np.linalg.norm(goal[sources][:, None] - goal[None], axis=2)
-    compared = reach >= SPAN * body.size  # infinite between pieces: nothing exceeds that
+    compared = reach >= SPAN * body.size  # infinite between pieces, which no distance exceeds
     excess = np.where(compared, apart - MAX_STRETCH * reach, -np.inf)
     row, other = np.unravel_index(excess.argmax(), excess.shape)
     if excess[row, other] > NOISE * body.size:

@@ -14,27 +14,27 @@ from jaxsimp.goals.shapes import Positions
 
 
 def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positions]:
-    """A goal from a file, and the body that it is for.
+    """A goal from a file, and its body.
 
     An `.npz` file holds `positions`, shape (N, 3), metres, and may hold `rest`, the rest
     coordinates, shape (N, 3), or (N, 2) for a flat body, and `faces`, shape (F, 3). A mesh file
-    (OBJ, PLY, OFF, GLB, ...) holds the positions as its points, in the body's order: they are
-    not welded, and an STL file, which repeats its points, will not match.
+    (OBJ, PLY, OFF, GLB, ...) holds the positions as its points, in the body's order. Points are
+    not welded, so an STL file, which repeats its points, does not match.
 
-    Without a body an `.npz` file defines it, with default physics. With `faces` it is
-    `from_mesh(rest, faces)`; without `rest` it is flat at rest, its edges as long as they are in
-    the goal (see `jaxsimp.goals.flatten`): right to about 1 % of its size where creases lie
-    along edges of the triangles, and otherwise short by up to a triangle at each crease.
-    Without `faces` it is a rope: at rest along `rest` if that is given, and otherwise straight,
-    evenly spread by the median distance of neighbours in the goal.
+    Without `body` an `.npz` file defines the body, with default physics. With `faces` it is
+    `from_mesh(rest, faces)`; without `rest` it is flat at rest, with the edge lengths of the goal
+    (see `jaxsimp.goals.flatten`): accurate to about 1 % of its size where creases lie along edges
+    of the triangles, otherwise too short by up to a triangle at each crease. Without `faces` it
+    is a rope: at rest along `rest` if given, otherwise straight, evenly spaced by the median
+    distance of neighbours in the goal.
 
     Args:
-        path: of the file.
-        body: the one that the goal is for.
+        path: path of the file.
+        body: body of the goal.
 
     Raises:
-        ValueError: if the file cannot be read or lacks what is needed, the body that it defines
-            is refused, or the goal is (see `check_goal`).
+        ValueError: if the file cannot be read or lacks an array, or if the body that it defines
+            or the goal is invalid (see `check_goal`).
     """
     with _naming(path):
         if _is_npz(path):
@@ -52,15 +52,15 @@ def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positio
 def load_body(path: str | Path) -> Body:
     """A body from a file, with default physics.
 
-    An `.npz` file holds `rest`, shape (N, 3), or (N, 2) for a flat body, metres, and `faces`,
-    shape (F, 3), of a sheet; without `faces` it is a rope. Any other file is a mesh at rest
-    (OBJ, PLY, STL, OFF, GLB, ...), in metres; it is cleaned (see `jaxsimp.bodies.clean_mesh`).
+    An `.npz` file holds `rest`, shape (N, 3), or (N, 2) for a flat body, metres, and for a sheet
+    `faces`, shape (F, 3); without `faces` the body is a rope. Any other file is a mesh at rest
+    (OBJ, PLY, STL, OFF, GLB, ...), in metres, which `jaxsimp.bodies.clean_mesh` cleans.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
-        ValueError: if the file cannot be read or lacks what is needed, or the body is refused.
+        ValueError: if the file cannot be read or lacks an array, or the body is invalid.
     """
     with _naming(path):
         if not _is_npz(path):
@@ -75,7 +75,7 @@ def _is_npz(path: str | Path) -> bool:
 
 @contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """Put the path before a refusal that does not name it."""
+    """Put the path before the message of an error that does not name it."""
     try:
         yield
     except ValueError as error:
@@ -85,11 +85,11 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def _read_arrays(path: str | Path, needed: str) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz` file that make a goal or a body."""
+    """The arrays of an `.npz` file that define a goal or a body."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in ("positions", "rest", "faces") if name in file}
-    except Exception as error:  # np.load raises whatever a broken file makes of it
+    except Exception as error:  # np.load raises many kinds of errors on a broken file
         raise ValueError(
             f"it cannot be read as .npz ({type(error).__name__}: {error}); write it with "
             f"np.savez(path, {needed}={needed})"
@@ -138,7 +138,7 @@ def _body_of(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> Body:
 
 
 def _rows_of_three(name: str, array: np.ndarray) -> np.ndarray:
-    """Coordinates as floats, with z = 0 where rest coordinates have none."""
+    """Coordinates as floats, with z = 0 for flat rest coordinates."""
     if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
         raise ValueError(f"{name} is of {array.dtype}; real numbers are needed, in metres")
     if name == "rest" and array.ndim == 2 and array.shape[1] == 2:

@@ -1,11 +1,11 @@
-"""Rest coordinates of a sheet from a goal: its triangles laid flat, every edge as long as it is.
+"""Rest coordinates of a sheet from a goal: triangles laid flat with the goal's edge lengths.
 
-A folded or crumpled sheet is nearly isometric to its flat rest, and layers that coincide in
-space are still apart along the sheet. So distances along the edges give a first layout
+A folded or crumpled sheet is nearly isometric to its flat rest shape, and layers that coincide in
+space are still apart along the sheet. Distances along the edges therefore give a first layout
 (multidimensional scaling, as in J. Tenenbaum et al., "A global geometric framework for nonlinear
-dimensionality reduction", 2000), and Gauss-Newton steps fit the lengths of the edges. Edges
-that are wrong, as those across a crease are, count less and less (S. Geman and D. McClure's
-loss, its scale lowered in stages).
+dimensionality reduction", 2000), and Gauss-Newton steps fit the lengths of the edges. The weight
+of wrong edges, such as those across a crease, falls in stages (S. Geman and D. McClure's loss,
+with a decreasing scale).
 """
 
 import numpy as np
@@ -22,9 +22,9 @@ from jaxsimp.bodies.topology import (
 from jaxsimp.goals.shapes import Positions
 
 SCALES = (1.0, 0.3, 0.1)
-"""Misfit at which an edge begins to count less, relative to the median edge: one a stage."""
+"""Misfit above which an edge's weight falls, relative to the median edge, for each stage."""
 STEPS = 20
-"""Steps of each stage: half of them suffice on folded cloths and garments."""
+"""Number of steps per stage: half of them suffice on folded cloths and garments."""
 DAMPING = 1e-3
 """Stiffness that holds each point, relative to an edge: without it a solution may float."""
 MOST_LANDMARKS = 64
@@ -36,18 +36,18 @@ on a cloth with 12.5 mm between particles gives 0.01, a hemisphere with a rim 0.
 def flatten(positions: Positions, faces: Faces) -> Float[np.ndarray, "N 2"]:
     """Flat rest coordinates of a sheet in a goal, shape (N, 2), metres.
 
-    They are turned so that the smallest box around them lies along x and y, its longer side
-    along x, and the first triangle is counter-clockwise. Lengths are right where creases lie
-    along edges. An edge across a crease is shorter than at rest, by how much is unknown: the
-    sheet loses up to the width of a triangle there.
+    The smallest box around them lies along x and y, its longer side along x, and the first
+    triangle is counter-clockwise. Lengths are accurate where creases lie along edges. An edge
+    across a crease is shorter than at rest by an unknown amount: the sheet loses up to the width
+    of a triangle there.
 
     Args:
-        positions: of the particles in the goal, shape (N, 3), metres.
+        positions: positions of the particles in the goal, shape (N, 3), metres.
         faces: particle ids of the triangles, shape (F, 3).
 
     Raises:
         ValueError: if the triangles are not those of a disc, the goal is on a line or too large,
-            or it does not lie flat: triangles would turn over, or edges would change by more
+            or it cannot be laid flat: triangles would turn over, or edges would change by more
             than `MISFIT` in the median.
     """
     edges = _edges_of_disc(faces, len(positions))
@@ -64,7 +64,7 @@ def flatten(positions: Positions, faces: Faces) -> Float[np.ndarray, "N 2"]:
             f"laid flat, its edges change by {misfit:.1%} in the median; {MISFIT:.0%} is the limit "
             f"for a sheet that is flat at rest. Add rest, or give the body"
         )
-    # A loss that forgives much may turn slivers over, where an earlier one did not.
+    # A stage with a small scale may turn slivers over that an earlier stage did not.
     lying = [points for points in stages[1:] if not _num_turned(points, faces)]
     if not lying:
         raise ValueError(
@@ -75,7 +75,7 @@ def flatten(positions: Positions, faces: Faces) -> Float[np.ndarray, "N 2"]:
 
 
 def _edges_of_disc(faces: np.ndarray, num_points: int) -> Int[np.ndarray, "E 2"]:
-    """The edges of triangles that make one disc of all points, shape (E, 2)."""
+    """The edges of triangles that form one disc of all points, shape (E, 2)."""
     _check_ids(faces, num_points)
     edges, _, count = distinct_edges(half_edges(faces)[0])
     pieces, _ = connected_pieces(edges, num_points)
@@ -98,7 +98,7 @@ def _edges_of_disc(faces: np.ndarray, num_points: int) -> Int[np.ndarray, "E 2"]
 
 
 def _check_extent(positions: np.ndarray) -> None:
-    """Refuse a goal that no sheet can have."""
+    """Raise a `ValueError` for a goal that is too large for a sheet, or on a line."""
     extent = float(np.ptp(positions, axis=0).max())
     if extent > LARGEST:
         raise ValueError(
@@ -111,7 +111,7 @@ def _check_extent(positions: np.ndarray) -> None:
 
 
 def _check_ids(faces: np.ndarray, num_points: int) -> None:
-    """Refuse triangles that are none, or of points that there are not."""
+    """Raise a `ValueError` for triangles with wrong shape, unknown points, or a point twice."""
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(f"faces has shape {faces.shape}; a row of three is needed for each")
     if faces.min() < 0 or faces.max() >= num_points:
@@ -126,11 +126,11 @@ def _check_ids(faces: np.ndarray, num_points: int) -> None:
 def _scaled_distances(
     num_points: int, edges: np.ndarray, lengths: np.ndarray
 ) -> Float[np.ndarray, "N 2"]:
-    """Points in the plane about as far apart as they are along the edges, shape (N, 2).
+    """Points in the plane with approximately their distances along the edges, shape (N, 2).
 
-    Classical scaling of the distances between some landmarks, and other points placed by their
-    distances from these (V. de Silva and J. Tenenbaum, "Sparse multidimensional scaling using
-    landmark points", 2004).
+    Classical scaling of the distances between some landmarks; their distances from these place the
+    other points (V. de Silva and J. Tenenbaum, "Sparse multidimensional scaling using landmark
+    points", 2004).
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import dijkstra
@@ -149,7 +149,7 @@ def _scaled_distances(
 def _fit_lengths(
     points: np.ndarray, edges: np.ndarray, lengths: np.ndarray, scale: float
 ) -> Float[np.ndarray, "N 2"]:
-    """Points moved so that edges have their lengths; a misfit far above `scale` is let be."""
+    """Points moved to fit the edges' lengths; a misfit far above `scale` has little weight."""
     from scipy.sparse import csc_array, eye_array
     from scipy.sparse.linalg import splu
 
@@ -177,7 +177,7 @@ def _num_turned(points: np.ndarray, faces: np.ndarray) -> int:
 
 
 def _upright(points: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "N 2"]:
-    """Points turned, and turned over, as `flatten` promises."""
+    """Points turned, and turned over, to the orientation that `flatten` documents."""
     from scipy.spatial import ConvexHull
 
     hull = points[ConvexHull(points).vertices]

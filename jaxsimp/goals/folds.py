@@ -14,12 +14,12 @@ from jaxsimp.goals.shapes import Positions, flat
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """A line on the table, and what is turned over about it.
+    """A line on the table, and the part of the body to turn over about it.
 
     Attributes:
         point: x and y of a point on the line, metres.
-        direction: x and y of the line's direction; what lies to its left is turned over.
-        part: which particles may be turned over, shape (N,); all by default.
+        direction: x and y of the line's direction; particles to its left are turned over.
+        part: true for particles that may be turned over, shape (N,); all by default.
     """
 
     point: Float[np.ndarray, " 2"]
@@ -30,15 +30,15 @@ class Fold:
 def fold_sequence(
     body: Body, folds: Iterable[Fold], positions: Positions | None = None
 ) -> Positions:
-    """One fold after another, shape (N, 3).
+    """Positions after one fold after another, shape (N, 3), metres.
 
     Args:
         body: the body whose thickness separates the layers.
         folds: in order.
-        positions: what is folded, shape (N, 3), metres; the body flat by default.
+        positions: positions before the folds, shape (N, 3), metres; the body flat by default.
 
     Raises:
-        ValueError: if a fold is refused (see `fold`).
+        ValueError: if a fold is invalid (see `fold`).
     """
     positions = flat(body) if positions is None else positions
     for one in folds:
@@ -54,19 +54,19 @@ def fold(
     *,
     part: Bool[np.ndarray, " N"] | None = None,
 ) -> Positions:
-    """Fold about a line: what lies to its left is turned over onto what lies to its right.
+    """Fold about a line: turn the particles to its left over onto its right side.
 
     The folded layers lie in reversed order, the lowest a thickness (twice the radius) above the
-    highest particle that they come to cover, or on the table if they cover nothing. Particles
-    on the line form the crease, a radius higher than they were.
+    highest particle that they cover, or on the table if they cover nothing. Particles on the line
+    form the crease, and rise by a radius.
 
     Args:
         body: the body whose thickness separates the layers.
-        positions: what is folded, shape (N, 3), metres.
+        positions: positions before the fold, shape (N, 3), metres.
         point: x and y of a point on the line, metres.
-        direction: x and y of the line's direction; its length does not matter.
-        part: which particles may be turned over, shape (N,): a sleeve, the upper layers; all
-            by default.
+        direction: x and y of the line's direction, of any length above zero.
+        part: true for particles that may be turned over, shape (N,), as a sleeve or the upper
+            layers; all by default.
 
     Raises:
         ValueError: if the direction has no length, or the line is not finite.
@@ -80,7 +80,7 @@ def fold(
         raise ValueError(f"point is {point.tolist()}; give finite coordinates in metres")
     left = np.array([-direction[1], direction[0]]) / norm
     distance = (positions[:, :2] - point) @ left
-    # A particle nearer to the line than rounding can tell is on the crease.
+    # A particle whose distance from the line is only rounding is on the crease.
     side = np.where(np.abs(distance) < 1e-6 * body.size, 0.0, np.sign(distance))
     moves, creases = side > 0, side == 0
     if part is not None:
@@ -106,10 +106,10 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
 
     Args:
         body: the cloth.
-        name: of the folds.
+        name: name of the folds.
 
     Raises:
-        ValueError: if there is no such name, or the cloth is not square for "four_corners".
+        ValueError: if the name is unknown, or the cloth is not square for "four_corners".
     """
     x, y = np.ptp(body.rest[:, :2], axis=0) / 2
     side = _fold_about((0.0, 0.0), (0.0, 1.0))
@@ -138,7 +138,7 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
 
 
 def sleeves_in(shirt: Garment) -> tuple[Fold, Fold]:
-    """Both sleeves of a flat T-shirt turned in about the lines of its sides, the left one first.
+    """Folds of both sleeves of a flat T-shirt inwards about the lines of its sides, left first.
 
     Raises:
         ValueError: if the garment has no sleeves.
@@ -152,7 +152,7 @@ def sleeves_in(shirt: Garment) -> tuple[Fold, Fold]:
 
 
 def leg_over_leg(trousers: Garment) -> tuple[Fold]:
-    """The left leg of flat trousers turned over onto the right one, about the middle line.
+    """Fold of the left leg of flat trousers onto the right one, about the middle line.
 
     Raises:
         ValueError: if the garment has no legs.
@@ -162,13 +162,13 @@ def leg_over_leg(trousers: Garment) -> tuple[Fold]:
 
 
 def _height_covered(body: Body, folded: np.ndarray, moves: np.ndarray) -> float:
-    """Height of the top of what the moved particles cover, metres; 0 for the bare table.
+    """Height of the highest particle that the moved particles cover, metres; 0 for the bare table.
 
-    Something is covered if it is within 3/4 of the usual edge of a moved particle seen from
-    above: on a square grid no place is farther than 0.71 from a particle, on equilateral
-    triangles 0.58. Where the moved part borders on another, as the corners of a cloth folded to
-    its centre do, it does not cover it: particles on a surface's boundary do not count, if
-    others moved.
+    A particle is covered if, seen from above, it is within 3/4 of the usual edge of a moved
+    particle: on a square grid no place is farther than 0.71 from a particle, on equilateral
+    triangles 0.58. A moved part does not cover a part that it only borders on, as at the corners
+    of a cloth folded to its centre: moved particles on a surface's boundary do not count, if other
+    particles moved.
     """
     from scipy.spatial import cKDTree
 
@@ -195,7 +195,7 @@ def _fold_about(point: tuple[float, float], direction: tuple[float, float]) -> F
 
 
 def _places(garment: Garment, *names: str) -> list[np.ndarray]:
-    """Places on the table of landmarks of a garment at rest."""
+    """Positions on the table of landmarks of a garment at rest."""
     missing = [name for name in names if name not in garment.landmarks]
     if missing:
         raise ValueError(

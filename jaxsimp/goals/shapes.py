@@ -32,8 +32,8 @@ def turn(positions: Positions, angle: float) -> Positions:
 def polyline(body: Body, corners: Float[np.ndarray, "M 2"]) -> Positions:
     """A rope laid along a polyline on the table, shape (N, 3).
 
-    Particles are spread evenly over the length of the polyline, which need not equal the
-    rest length: a shorter line is a slack rope.
+    Particles are evenly spaced over the length of the polyline, which may differ from the rest
+    length: a shorter line is a slack rope.
 
     Args:
         body: a rope.
@@ -71,11 +71,11 @@ def letter(body: Body, name: str, slack: float = 0.0) -> Positions:
 
     Args:
         body: a rope.
-        name: of the letter.
+        name: name of the letter.
         slack: fraction of the rest length by which the letter is shorter than the rope, below 1.
 
     Raises:
-        ValueError: if there is no such letter, or the slack is not from 0 to below 1.
+        ValueError: if the letter is unknown, or the slack is not from 0 to below 1.
     """
     if name not in _LETTERS:
         raise ValueError(f"letter is {name!r}; choose one of {', '.join(_LETTERS)}")
@@ -83,12 +83,12 @@ def letter(body: Body, name: str, slack: float = 0.0) -> Positions:
 
 
 def crossed_triangle(body: Body, slack: float = 0.0, tail: float = 0.5) -> Positions:
-    """A rope laid as an equilateral triangle whose two ends cross at the top and go on.
+    """A rope laid as an equilateral triangle whose two ends cross at the top and continue.
 
     Args:
         body: a rope.
         slack: fraction of the rest length by which the line is shorter than the rope, below 1.
-        tail: length of an end beyond the crossing, over the side of the triangle.
+        tail: length of an end beyond the crossing, as a multiple of the triangle's side.
 
     Raises:
         ValueError: if the slack is not from 0 to below 1, or the tail not above zero.
@@ -104,8 +104,8 @@ def crossed_triangle(body: Body, slack: float = 0.0, tail: float = 0.5) -> Posit
 def lift_crossings(body: Body, positions: Positions) -> Positions:
     """A rope on the table, its later particles lifted over earlier ones where it crosses itself.
 
-    At the crossing the upper part is a thickness (twice the radius) above the lower; it comes
-    down to its own height within two spacings of particles on either side.
+    At the crossing the upper part is a thickness (twice the radius) above the lower; it descends
+    to its own height within two particle spacings on either side.
 
     Args:
         body: a rope.
@@ -117,8 +117,8 @@ def lift_crossings(body: Body, positions: Positions) -> Positions:
     for second in range(2, len(steps)):
         away = positions[second, :2] - positions[: second - 1, :2]
         first_step, second_step = steps[: second - 1], steps[second]
-        # Shares of both steps at which their lines cross; parallel ones do not. A crossing at a
-        # particle is found at least once whatever the rounding.
+        # Fractions of both steps at which their lines cross; parallel lines do not. A crossing at
+        # a particle is found at least once for any rounding.
         area = _cross_product(first_step, second_step)
         lengths = np.linalg.norm(first_step, axis=1) * np.linalg.norm(second_step)
         parallel = np.abs(area) <= 1e-9 * lengths
@@ -130,7 +130,7 @@ def lift_crossings(body: Body, positions: Positions) -> Positions:
         for first in np.flatnonzero(crosses):
             share = on_first[first]
             below = (1 - share) * lifted[first, 2] + share * lifted[first + 1, 2]
-            # Full height at the ends of the upper step, none three particles away.
+            # Full height at the ends of the upper step, zero three particles away.
             apart = np.abs(index - second - on_second[first])
             weight = np.clip((3 - apart) / 2, 0.0, 1.0)
             height = positions[:, 2] + weight * (below + 2 * body.radius - positions[:, 2])
@@ -146,7 +146,7 @@ def _laid_along(body: Body, line: np.ndarray, slack: float) -> Positions:
             f"slack is {slack:g}; give a fraction of the rest length, from 0 to below 1"
         )
     length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
-    # The neighbours' rest lengths: a rope at rest need not be straight.
+    # Rest lengths between neighbours: a rope at rest may be curved.
     rest_length = np.linalg.norm(np.diff(body.rest, axis=0), axis=1).sum()
     middle = (line.min(axis=0) + line.max(axis=0)) / 2
     return polyline(body, (line - middle) * ((1 - slack) * rest_length / length))

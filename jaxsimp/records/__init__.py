@@ -1,4 +1,4 @@
-"""Records: rows of results, folders that one configuration owns, and provenance."""
+"""Records: rows of results, folders of one configuration each, plan files, and provenance."""
 
 from jaxsimp.records.folder import CONFIG_FILE, ResultsError, open_folder, write_json
 from jaxsimp.records.plan_file import SavedPlan, load_plan, save_plan

@@ -1,4 +1,4 @@
-"""Results on disk: a folder that one configuration owns, and JSON that is whole or absent."""
+"""Results on disk: a folder for one configuration, and atomic writes of JSON."""
 
 import json
 import os
@@ -10,11 +10,11 @@ CONFIG_FILE = "config.json"
 
 
 class ResultsError(ValueError):
-    """A results folder cannot be used as asked; the message says why and what to do."""
+    """A results folder is not usable; the message gives the reason and a remedy."""
 
 
 def open_folder(folder: Path, config: Mapping[str, Any]) -> None:
-    """Make a results folder for a configuration, or find the one made earlier.
+    """Make a results folder for a configuration, or open the existing one.
 
     Raises:
         ResultsError: if the folder is a file, cannot be written to, or was made with another
@@ -45,7 +45,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     except ValueError:  # neither JSON nor text
         config = None
     if not isinstance(config, dict):
-        raise ResultsError(f"{path} is no configuration of ours; give another folder with --out")
+        raise ResultsError(f"{path} is not a configuration file; give another folder with --out")
     return config
 
 
@@ -63,7 +63,7 @@ def _require_same(folder: Path, found: dict[str, Any], wanted: dict[str, Any]) -
 
 
 def write_json(path: Path, value: object) -> None:
-    """Write a JSON file that appears under its name whole or not at all."""
+    """Write a JSON file atomically: under its name it is complete or absent."""
     part = path.with_name(path.name + ".part")
     part.write_text(json.dumps(value, indent=1) + "\n")
     os.replace(part, path)

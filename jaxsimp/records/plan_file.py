@@ -1,8 +1,8 @@
-"""Plan files: a plan that can be viewed, replayed and exported without the study that made it.
+"""Plan files: a plan to view, replay and export without the study that made it.
 
 A file is an `.npz` of plain arrays: the actions, the motion, start and goal, the body's arrays
-under `body/`, and one text, `about`, of JSON: task, engine, score, and what the results depend on.
-Files of actions and motion alone, as version 0.1 wrote them, are read, too.
+under `body/`, and one JSON text, `about`: task, engine, score and environment. Files of version
+0.1, with actions and motion only, remain readable.
 """
 
 import dataclasses
@@ -27,21 +27,21 @@ from jaxsimp.records.provenance import environment
 from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, task_names
 
 SETTINGS = ("limits", "num_actions", "num_pickers", "action_seconds", "settle_actions")
-"""Numbers of a task that a file keeps."""
+"""Numbers of a task that a file stores."""
 
 
 @dataclass(frozen=True, eq=False)
 class SavedPlan:
-    """A plan that was read from a file.
+    """A plan read from a file.
 
     Attributes:
         actions: shapes (T, G) and (T, G, 3).
-        positions: of its execution, at the start, after each action, and settled, shape
+        positions: positions in its execution, at the start, after each action, and settled, shape
             (T + 2, N, 3), metres.
-        body: what is manipulated; None in a file of version 0.1.
+        body: the manipulated body; None in a file of version 0.1.
         episode: start and goal; None in a file of version 0.1.
-        about: task, engine, score, status, missed contacts, environment, and what the writer added
-            under `found`; empty in a file of version 0.1.
+        about: task, engine, score, status, number of tunnelled contacts (`missed`), environment,
+            and the writer's entries under `found`; empty in a file of version 0.1.
     """
 
     actions: Actions
@@ -53,11 +53,11 @@ class SavedPlan:
     def task(self) -> Task:
         """The task of the plan, with its body, start and goal, to replay or score it.
 
-        A registered task has its own costs; any other is given the mean distance to the goal, as
-        a file holds no functions.
+        A registered task has its own costs; any other has the mean distance to the goal as cost,
+        since a file holds no functions.
 
         Raises:
-            ValueError: if the file is of version 0.1, which keeps no task.
+            ValueError: if the file is of version 0.1, which stores no task.
         """
         if self.body is None or self.episode is None:
             raise ValueError(
@@ -94,17 +94,17 @@ def save_plan(
     found: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a plan as `.npz`: it appears under its name whole or not at all.
+    """Write a plan as `.npz`, atomically: under its name the file is complete or absent.
 
     Args:
-        path: of the file.
-        task: what was asked.
+        path: path of the file.
+        task: the task of the plan.
         episode: start and goal.
         actions: the plan.
-        execution: what the plan does.
-        engine: that executed it; its text is kept.
-        found: what else is worth keeping, as JSON: how the plan was found.
-        provenance: what the results depend on, by default `environment()`.
+        execution: the execution of the plan.
+        engine: engine of the execution; the file stores its text.
+        found: further entries, as JSON, such as the search that found the plan.
+        provenance: versions, commit, device and cores; `environment()` by default.
     """
     about = {
         "task": _task_text(task),
@@ -184,7 +184,7 @@ def _body_arrays(body: Body) -> dict[str, np.ndarray]:
 
 
 def _body_text(body: Body) -> dict[str, Any]:
-    """Everything of a body but its arrays."""
+    """Everything of a body except its arrays."""
     names = [field.name for field in dataclasses.fields(body) if not _is_array(field, body)]
     values = {name: getattr(body, name) for name in names}
     return values | {"material": dataclasses.asdict(body.material)}

@@ -1,4 +1,4 @@
-"""Provenance: what results depend on besides their configuration."""
+"""Provenance: the environment that results depend on, besides their configuration."""
 
 import importlib.metadata
 import platform
@@ -25,7 +25,7 @@ PACKAGES = (
 
 
 def environment() -> dict[str, Any]:
-    """What results depend on besides their configuration: versions, commit, device, cores."""
+    """Versions, commit, device and cores, on which results depend besides their configuration."""
     device = jax.devices()[0]
     return {
         "python": platform.python_version(),
@@ -48,7 +48,7 @@ def _version(package: str) -> str:
 
 
 def _commit() -> str:
-    """The commit that the code is at, with `+changes` where files differ from it."""
+    """The commit of the code, with `+changes` if files differ from it."""
     root = Path(__file__).parent
     git = ["git", "-C", str(root)]
     try:

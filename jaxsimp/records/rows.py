@@ -1,4 +1,4 @@
-"""Rows of results: JSON lines that survive a kill, and what is left to do."""
+"""Rows of results: JSON lines that survive a kill, and the keys without a row."""
 
 import json
 import os
@@ -12,12 +12,11 @@ Key = TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True)
 class RowFile:
-    """A JSON-lines file of results, which a killed study resumes.
+    """A JSON-lines file of results, from which a killed study resumes.
 
     Attributes:
-        path: of the file, which need not exist.
-        identity: names of the fields that tell a row from all others. Their values, as a tuple,
-            are the row's key.
+        path: path of the file, which may not exist yet.
+        identity: names of the fields that identify a row. Their values, as a tuple, are its key.
     """
 
     path: Path
@@ -28,7 +27,7 @@ class RowFile:
         return tuple(row[name] for name in self.identity)
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Add a row, and make sure that it is on the disk."""
+        """Add a row, and flush it to the disk."""
         append_row(self.path, row)
 
     def left(self, keys: Iterable[Key]) -> list[Key]:
@@ -48,7 +47,7 @@ class RowFile:
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Add one line to a JSON-lines file and make sure that it is on the disk."""
+    """Add one line to a JSON-lines file, and flush it to the disk."""
     with path.open("a") as file:
         file.write(json.dumps(row) + "\n")
         file.flush()
@@ -56,7 +55,7 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a JSON-lines file; a last line cut short by a kill is removed from it."""
+    """The rows of a JSON-lines file; removes a last line that a kill left incomplete."""
     if not path.exists():
         return []
     whole, newline, rest = path.read_text().rpartition("\n")

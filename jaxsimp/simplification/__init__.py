@@ -1,4 +1,4 @@
-"""Simplification: a goal configuration to the key points that matter for it."""
+"""Simplification: reduce a goal to its key points, the particles that a model of it keeps."""
 
 from jaxsimp.simplification.key_points import FitStatus, KeyPoints
 from jaxsimp.simplification.methods import METHODS, simplify, simplify_batch

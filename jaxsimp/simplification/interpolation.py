@@ -1,8 +1,8 @@
 """Models as interpolation in rest coordinates: p ≈ W q, for ropes and surfaces alike.
 
-Particle `i` is where the model's simplex nearest to its rest coordinates takes it: row `i` of
-`W` holds the barycentric coordinates of the nearest point. Distances between a particle's goal
-and `W q` see every layer of a folded goal, as distances between surfaces cannot.
+Row `i` of `W` holds the barycentric coordinates of the point nearest to the rest coordinates of
+particle `i`, in the simplex that is nearest to them. Distances between a particle's goal and
+`W q` distinguish the layers of a folded goal; distances between surfaces do not.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ def interpolation_weights(
 ) -> Float[np.ndarray, "N K"]:
     """Weights of the key points in the model's position of every particle, shape (N, K).
 
-    Of simplices that are equally near the first counts. So parts of a body that lie on each
-    other at rest, as the two sides of a flat shirt, cannot be told apart.
+    Of simplices at the same distance the first counts. Parts of a body that coincide at rest, as
+    the two sides of a flat shirt, are therefore not distinguished.
 
     Args:
         rest: rest coordinates of the particles, metres.
@@ -29,7 +29,7 @@ def interpolation_weights(
     least = np.full(len(rest), np.inf)
     chosen = np.zeros(len(rest), dtype=int)
     coordinates = np.zeros((len(rest), elements.shape[1]))
-    closer = 1e-12 * np.ptp(rest, axis=0).max() ** 2  # than rounding
+    closer = 1e-12 * np.ptp(rest, axis=0).max() ** 2  # above rounding
     for index, element in enumerate(elements):
         nearest, squared = nearest_in_simplex(rest, rest[particles[element]])
         better = squared < least - closer
@@ -57,11 +57,11 @@ def nearest_in_simplex(
 
     Args:
         points: shape (N, 3), metres.
-        corners: of a segment (E = 2) or a triangle (E = 3), which may have no length or area.
+        corners: corners of a segment (E = 2) or a triangle (E = 3); length or area may be zero.
 
     Returns:
-        Coordinates, shape (N, E), none below zero and each row summing to 1; and squared
-        distances, shape (N,), square metres.
+        Coordinates, shape (N, E), at least zero, each row summing to 1; and squared distances,
+        shape (N,), square metres.
     """
     if len(corners) == 2:
         coordinates = _in_segment(points, corners)
@@ -91,8 +91,8 @@ def _in_triangle(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     longest = np.sum((corners - np.roll(corners, 1, axis=0)) ** 2, axis=1).max()
     if np.linalg.norm(normal) <= THIN * longest:
         return best
-    # The coordinate of a corner is the share of the triangle that the opposite edge makes with
-    # the point: two areas along the normal, and what is left.
+    # A corner's coordinate is a fraction of the triangle's area: that of the triangle between the
+    # opposite edge and the point. Two come from areas along the normal, the third is the rest.
     offset = points - corners[0]
     inner = np.stack([np.cross(offset, edges[1]), np.cross(edges[0], offset)]) @ normal
     inner /= normal @ normal

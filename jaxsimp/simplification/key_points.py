@@ -1,4 +1,4 @@
-"""Key points: the few particles that a goal makes worth grasping."""
+"""Key points: the particles of a body that the model of a goal keeps, as candidates to grasp."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 
 class FitStatus(IntEnum):
-    """What became of the search for a goal's model."""
+    """Result of the search for a goal's model."""
 
     FITS = 0
     NO_FIT = 1
@@ -22,26 +22,25 @@ class KeyPoints:
 
     A model is piecewise linear in rest coordinates: particles at `W positions`, where row `i` of
     `W` interpolates between the key points around the rest coordinates of particle `i` (see
-    interpolation.py). That is one notion of error for ropes and surfaces; `errors` are in the
-    norm by which the method chooses.
+    interpolation.py). `max_error` and `rms_error` are thus defined alike for ropes and surfaces;
+    `errors` are in the norm by which the method chooses.
 
     Attributes:
         particles: ids of the key points in ascending order, shape (K,).
-        positions: where the model has them in the goal, shape (K, 3), metres.
+        positions: positions of the key points in the model, shape (K, 3), metres.
         elements: the model's segments, shape (K - 1, 2), or triangles, shape (M, 3), as
             indices into `particles`.
         num_particles: number of particles of the body, `N`.
-        method: what found them.
+        method: name of the method that found them.
         sizes: numbers of key points tried, in ascending order: up to the first that fits, and
-            a few beyond, which show what more key points would buy.
+            a few more, which show the effect of further key points on the error.
         errors: error of the model at each size, metres.
         tolerance: error below which a model fits, metres.
         max_error: largest distance of a particle from the model, metres.
         rms_error: root mean square of those distances, metres.
-        certified: whether it is proven that no model with fewer key points fits.
-        status: `FITS`, or why no model fits. Where none of the sizes does, this is one that was
-            tried, as the method says; where constraints contradict each other there are no key
-            points.
+        certified: whether a proof exists that no model with fewer key points fits.
+        status: `FITS`, or the reason why no model fits. With `NO_FIT` the model is one of those
+            tried (see the method); with `INFEASIBLE` there are no key points.
     """
 
     particles: Int[np.ndarray, " K"]
@@ -74,7 +73,7 @@ class KeyPoints:
 
 
 SIZES_BEYOND = 3
-"""Sizes tried after the first that fits."""
+"""Number of sizes tried after the first that fits."""
 
 
 def smallest_fit(
@@ -82,7 +81,7 @@ def smallest_fit(
 ) -> tuple[int | None, dict[int, float]]:
     """The first size whose error is below the tolerance, and the errors of all sizes tried.
 
-    Sizes are tried one by one, since errors need not fall with every further key point.
+    Tries the sizes one by one, since a further key point may raise the error.
 
     Args:
         error_fn: error of the model of a size, metres.
@@ -90,8 +89,7 @@ def smallest_fit(
         tolerance: metres.
 
     Returns:
-        The size, None if no model fits, and the errors by size, `SIZES_BEYOND` further than
-        needed.
+        The size, None if no model fits, and the errors by size, `SIZES_BEYOND` sizes further.
     """
     errors: dict[int, float] = {}
     fitting: list[int] = []

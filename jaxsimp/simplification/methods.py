@@ -1,4 +1,4 @@
-"""The methods of simplification by name, and the doors to them: `simplify`, `simplify_batch`."""
+"""Methods of simplification by name, and the functions that call them."""
 
 import numpy as np
 from jaxtyping import Float
@@ -32,23 +32,23 @@ def simplify_batch(
 ) -> list[KeyPoints]:
     """Key points of a batch of goals: the smallest accurate model of each.
 
-    That a goal has no model is its status, and does not concern the others.
+    A goal without a model has a status other than `FITS`; the other goals are unaffected.
 
     Args:
         body: a rope, or a body with triangles.
         goals: goal positions, shape (B, N, 3), metres.
-        method: "robust": the best breakpoints for ropes, a collapse that knows rest coordinates
+        method: "robust": optimal breakpoints for ropes, edge collapse in goal and rest coordinates
             for surfaces; "paper": evenly spread breakpoints for ropes, quadric edge collapse
-            with the Hausdorff distance for surfaces; "meshlab": the same with the paper's own
-            tool, an extra.
+            with the Hausdorff distance for surfaces; "meshlab": as "paper", but with MeshLab, the
+            paper's tool (an optional extra).
         tolerance: error below which a model fits, metres; the method's own by default.
         max_size: largest number of key points tried; the method's own by default.
-        workspace: limits that the model of a rope keeps to, metres; none by default. A goal
-            that has no model within them has the status `INFEASIBLE`.
+        workspace: limits on the model of a rope, metres; none by default. A goal that has no
+            model within them has the status `INFEASIBLE`.
 
     Raises:
-        ValueError: if there is no such method, a goal is not one of this body, a number is
-            out of its range, or a workspace is given for a surface.
+        ValueError: if the method is unknown, a goal does not fit the body, a number is out of
+            range, or a workspace is given for a surface.
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}")
@@ -87,7 +87,7 @@ def simplify(
         workspace: as for `simplify_batch`.
 
     Raises:
-        ValueError: as for `simplify_batch`, or if no model fits or none is within the workspace.
+        ValueError: as for `simplify_batch`, or if no model fits or lies within the workspace.
     """
     goals = np.asarray(goal)[None]
     (points,) = simplify_batch(

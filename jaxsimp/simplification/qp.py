@@ -1,8 +1,8 @@
 """Batched convex quadratic programmes, and the backends that solve them.
 
 A problem is: minimise ½ x'Hx + g'x subject to A x = b, lower <= x <= upper and
-C_lower <= C x <= C_upper. A batch holds B problems of one shape; what happens to one problem is
-reported as its status and never stops the others.
+C_lower <= C x <= C_upper. A batch holds B problems of one shape. Each problem has a status; a
+problem that fails does not stop the others.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 
 class SolverStatus(IntEnum):
-    """What became of one problem; `NOT_CONVERGED` includes problems without a lower bound."""
+    """Result of one problem; `NOT_CONVERGED` includes problems without a lower bound."""
 
     SOLVED = 0
     INFEASIBLE = 1
@@ -41,8 +41,8 @@ class QuadraticProgram:
             the two is given exactly when `C` is.
 
     Raises:
-        ValueError: if shapes disagree, a number is not a number, or an H is not convex.
-            Contradictory constraints are no error: their status is `INFEASIBLE`.
+        ValueError: if shapes disagree, a number is not finite where it must be, or an H is not
+            convex. Contradictory constraints raise nothing: their status is `INFEASIBLE`.
     """
 
     H: Float[np.ndarray, "B n n"]
@@ -75,8 +75,9 @@ class Solution:
     Attributes:
         x: minimisers, shape (B, n); NaN exactly in the rows that are not solved.
         status: `SolverStatus` of each problem, shape (B,).
-        multipliers: of the inequalities C x, shape (B, k): above zero where the upper bound
-            holds x back, below zero where the lower one does; no meaning where not solved.
+        multipliers: Lagrange multipliers of the inequalities C x, shape (B, k): above zero where
+            the upper bound is active, below zero where the lower one is; meaningless where not
+            solved.
     """
 
     x: Float[np.ndarray, "B n"]
@@ -96,16 +97,16 @@ def solve(problem: QuadraticProgram, backend: str = "proxsuite") -> Solution:
         problem: the batch.
         backend: "closed_form" (JAX, equalities only), "proxsuite" (proximal augmented
             Lagrangian, Bambade et al. 2022) or "qpsolvers" (the same algorithm, one problem
-            a call: a reference).
+            per call: a reference).
 
     Raises:
-        ValueError: if there is no such backend, or it cannot handle the constraints.
+        ValueError: if the backend is unknown, or cannot handle the constraints.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend is {backend!r}; choose one of {', '.join(BACKENDS)}")
     solution = BACKENDS[backend](problem)
     status = np.where(_crossed(problem), SolverStatus.INFEASIBLE, solution.status)
-    # ProxQP overlooks some contradictions, such as those of parallel rows with two bounds each.
+    # ProxQP misses some contradictions, such as those of parallel rows with two bounds each.
     for index in np.flatnonzero(status == SolverStatus.NOT_CONVERGED).tolist():
         if _contradictory(problem, index):
             status[index] = SolverStatus.INFEASIBLE
@@ -150,7 +151,7 @@ def closed_form(
 
     Solves the KKT conditions with pseudo-inverses (Nocedal & Wright, "Numerical
     Optimization", section 16.2), so H may be singular and constraints may repeat each other.
-    Residuals of the conditions decide the status; a row that is not solved has no meaning.
+    The residuals of the conditions decide the status; rows that are not solved are meaningless.
 
     Args:
         H: symmetric positive semidefinite, shape (B, n, n).
@@ -224,7 +225,7 @@ def _qpsolvers(problem: QuadraticProgram) -> Solution:
 
 
 def _statuses(codes: list) -> np.ndarray:
-    """Statuses of ProxQP as ours, shape (B,)."""
+    """ProxQP's status codes as `SolverStatus`, shape (B,)."""
     from proxsuite import proxqp
 
     ours = {
@@ -235,10 +236,10 @@ def _statuses(codes: list) -> np.ndarray:
 
 
 def _problems(problem: QuadraticProgram, indices: Iterable[int] | None = None) -> Iterator[tuple]:
-    """H, g, A, b, C and its bounds, lower and upper of problems, all by default, in float64.
+    """H, g, A, b, C and its bounds, lower and upper of some problems (by default all), float64.
 
-    Bounds that cross are left out: ProxQP iterates for seconds on them, and does not call them
-    infeasible.
+    Crossed bounds become infinite: ProxQP iterates on them for seconds and does not report them
+    as infeasible.
     """
     crossed = _crossed(problem)[:, None]
     lower, upper = _open_bounds(problem.lower, problem.upper, problem.g.shape, crossed)
@@ -254,7 +255,7 @@ def _problems(problem: QuadraticProgram, indices: Iterable[int] | None = None) -
 def _open_bounds(
     lower: np.ndarray | None, upper: np.ndarray | None, shape: tuple[int, ...], away: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both bounds as arrays, infinite where there is none and in the problems `away`."""
+    """Both bounds as arrays, infinite where a bound is absent and in the problems `away`."""
     infinite = np.full(shape, np.inf)
     return (
         -infinite if lower is None else np.where(away, -np.inf, lower),
@@ -263,7 +264,7 @@ def _open_bounds(
 
 
 def _crossed(problem: QuadraticProgram) -> np.ndarray:
-    """Problems whose bounds leave nothing between them, shape (B,)."""
+    """True for problems with a lower bound above its upper bound, shape (B,)."""
     crossed = np.zeros(len(problem), dtype=bool)
     for low, high in ((problem.lower, problem.upper), (problem.C_lower, problem.C_upper)):
         lower = np.array([[-np.inf]]) if low is None else low
@@ -325,8 +326,8 @@ BACKENDS: dict[str, Backend] = {
     "proxsuite": _proxsuite,
     "qpsolvers": _qpsolvers,
 }
-# Absolute, since a residual of metres has a meaning; 1e-10 m is far below any goal's accuracy.
-# Without the duality gap ProxQP calls points solved that are 1e-6 off an active bound.
+# Absolute tolerances, since residuals are in metres; 1e-10 m is far below any goal's accuracy.
+# Without the duality gap ProxQP accepts points that are 1e-6 off an active bound.
 PROXQP_SETTINGS: dict[str, Any] = {
     "eps_abs": 1e-10,
     "eps_rel": 0.0,

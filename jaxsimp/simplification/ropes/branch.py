@@ -1,10 +1,10 @@
 """Exact piecewise-linear fits of ropes, by branch and bound over breakpoints at particles.
 
-Compiled by numba, in float64, on the host: what the dynamic programmes of search.py leave
-open is seldom more than a few hundred chains. Segments and the costs of chains are as there.
+Compiled by numba, in float64, on the host: the dynamic programmes of search.py seldom leave more
+than a few hundred chains open. Segments and the costs of chains are defined there.
 """
 
-from typing import no_type_check  # numba needs the functions as they are, not wrapped in checks
+from typing import no_type_check  # numba cannot compile functions wrapped in type checks
 
 import numba
 import numpy as np
@@ -29,18 +29,18 @@ def settle(
 
     Args:
         goals: shape (B, N, 3), metres, centred.
-        breakpoints: of a fit of each size 2, 3, ..., M + 1, shape (B, M, M + 1), as in
-            `RopeFits`. Smaller and better fits, where there are any, are written into it.
-        proven: whether it is known that no fit of a size is good enough, shape (B, M).
+        breakpoints: breakpoints of a fit of each size 2, 3, ..., M + 1, shape (B, M, M + 1), as
+            in `RopeFits`; changed in place to smaller and better fits.
+        proven: whether a proof exists that no fit of a size is below `limit`, shape (B, M).
         limit: squared error that a fit must be below, square metres.
         gains: `regression_gains` of segments, shape (2, N, 3).
         stiffness: `segment_stiffness`, shape (2, N).
-        node_limit: largest number of chains looked at for one goal and size.
+        node_limit: largest number of chains evaluated for one goal and size.
 
     Returns:
-        Where among the sizes the smallest fit is, M if there is none, shape (B,); whether that
-        no smaller one is good enough and none of its size is better is proven, shape (B,); and
-        squared errors of the fits of all sizes, square metres, shape (B, M).
+        Index of the size of the smallest fit, M if there is none, shape (B,); whether a proof
+        exists that no smaller fit is below `limit` and no fit of this size is better, shape (B,);
+        and squared errors of the fits of all sizes, square metres, shape (B, M).
     """
     batch, most = breakpoints.shape[:2]
     places, certified = np.zeros(batch, np.int64), np.ones(batch, np.bool_)
@@ -66,7 +66,7 @@ def settle(
             cost[place] = least
         certified[index] = finished
         if place < most:
-            # Of equal fits the first in order is taken, whichever was known before.
+            # Of equal fits take the first in order, independent of the fit known before.
             fit, least = fits[place, : place + 2], cost[place]
             below = min(limit, least + TIE * (least + TIE * limit))
             cost[place], finished = _branch(
@@ -89,27 +89,27 @@ def _branch(
     below: float,
     node_limit: int,
 ) -> tuple[float, bool]:
-    """Look, in order of breakpoints, for the best fit whose squared error is below `below`.
+    """Search, in order of breakpoints, for the best fit whose squared error is below `below`.
 
     Args:
         points: shape (N, 3).
         lines: `_regression_lines`.
         stiffness: shape (2, N).
         bounds: `_suffix_bounds`.
-        fit: breakpoints of the fit known so far, shape (K,); a better one is written into it.
-        least: its squared error.
-        below: what to be below; above `least` by what makes no difference, or all there is.
-        node_limit: largest number of chains looked at.
+        fit: breakpoints of the fit known so far, shape (K,); changed in place to a better one.
+        least: squared error of `fit`.
+        below: squared error that a fit must be below; slightly above `least` to accept equal fits.
+        node_limit: largest number of chains evaluated.
 
     Returns:
-        The squared error of `fit`, and whether nothing was left out.
+        The squared error of `fit`, and whether the search was complete.
     """
     size, last = len(fit), len(points) - 1
     ends, chains = np.zeros(size, np.int64), np.zeros((size, 5))
     _start(points, chains[0])
     depth, nodes = 1, 0
     while depth > 0:
-        left = size - 1 - depth  # segments yet to come
+        left = size - 1 - depth  # segments still to add
         ends[depth] = last if left == 0 else ends[depth] + 1
         if ends[depth] > last - left:
             depth -= 1
@@ -155,7 +155,7 @@ def _cost(
 @numba.njit(cache=True)
 @no_type_check
 def _start(points: Float[np.ndarray, "N 3"], chain: Float[np.ndarray, " 5"]) -> None:
-    """Write the chain without a segment: half of the first particle."""
+    """Write the chain without a segment: half the weight of the first particle."""
     chain[0], chain[1] = 0.5, 0.0
     chain[2:] = points[0]
 
@@ -183,7 +183,7 @@ def _extend(
 @numba.njit(cache=True)
 @no_type_check
 def _close(chain: Float[np.ndarray, " 5"], last: Float[np.ndarray, " 3"]) -> float:
-    """Squared error of a chain with the other half of the last particle."""
+    """Squared error of a chain, with the second half of the last particle's weight."""
     squared = 0.0
     for axis in range(3):
         squared += (chain[2 + axis] - last[axis]) ** 2
@@ -224,16 +224,16 @@ def _suffix_bounds(
     stiffness: Float[np.ndarray, "2 N"],
     most: int,
 ) -> Float[np.ndarray, "M+1 N"]:
-    """What m segments from a particle to the last one cost at least, by m and particle.
+    """Lower bound on the cost of m segments from a particle to the last, by [m, particle].
 
-    The segments need not meet, so each costs no more than in a chain.
+    The bound lets segments be disconnected, so each costs no more than in a chain.
     """
     count = len(points)
     bounds = np.full((most + 1, count), np.inf)
     chain = np.zeros(5)
     for first in range(count - 1):
         alpha, beta = stiffness[:, count - 1 - first]
-        # The segment alone, its first end wherever it likes.
+        # The segment alone, its first end free.
         chain[0], chain[1] = alpha - beta * beta / alpha, lines[first, -1, 0]
         chain[2:] = lines[first, -1, 4:]
         bounds[1, first] = _close(chain, points[-1])

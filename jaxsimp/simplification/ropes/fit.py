@@ -1,7 +1,7 @@
 """Ropes: the best positions of given breakpoints, free or in a workspace (equation 3).
 
-A fit is p ≈ W q, with the hat functions of the breakpoints in W: least squares where nothing
-else is asked, and a quadratic programme in q where the model must be one that a robot can lay.
+A fit is p ≈ W q, with the hat functions of the breakpoints in W: least squares without a
+workspace, a quadratic programme in q with one.
 """
 
 from dataclasses import dataclass, field
@@ -18,20 +18,19 @@ Bound = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where the model of a rope may be.
+    """Limits on the model of a rope.
 
     Attributes:
         lower: lowest x, y, z, metres.
         upper: highest x, y, z, metres.
-        above_table: keep the model a radius above z = 0.
-        fixed_ends: keep the model's ends at the goal's.
-        max_stretch: how much longer than at rest a segment may be, relative to its rest length;
-            None for any. Least squares alone stretch a segment by up to a quarter. With fixed
-            ends leave some, say 0.05: a taut goal with noise is longer than the rope.
+        above_table: keep the model at least the rope's radius above z = 0.
+        fixed_ends: keep the model's ends at the ends of the goal.
+        max_stretch: largest elongation of a segment, relative to its rest length; None for no
+            limit. Least squares alone stretch a segment by up to a quarter. With fixed ends
+            allow some, such as 0.05: a taut goal with noise is longer than the rope.
 
     Raises:
-        ValueError: if a bound is not a number, `lower` is above `upper`, or `max_stretch` is
-            below zero.
+        ValueError: if a bound is NaN, `lower` is above `upper`, or `max_stretch` is below zero.
     """
 
     lower: Bound = (-np.inf,) * 3
@@ -54,14 +53,14 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """A workspace as it is for one rope.
+    """The limits that a workspace sets for one rope.
 
     Attributes:
         lower: lowest x, y, z, shape (3,), metres.
         upper: highest x, y, z, shape (3,), metres.
         fixed_ends: whether the model's ends are the goal's.
-        reach: how long the model may be from the first particle to each, shape (N,), metres;
-            None for any length.
+        reach: largest length of the model from the first particle to each, shape (N,), metres;
+            None for no limit.
     """
 
     lower: Float[np.ndarray, " 3"] = field(default_factory=lambda: np.full(3, -np.inf))
@@ -71,13 +70,13 @@ class Limits:
 
     @property
     def is_free(self) -> bool:
-        """Whether they limit nothing."""
+        """Whether there is no limit."""
         boxed = np.isfinite([self.lower, self.upper]).any()
         return not (boxed or self.fixed_ends or self.reach is not None)
 
 
 def limits_of(body: Body, workspace: Workspace) -> Limits:
-    """The limits that a workspace sets to the model of a rope."""
+    """The limits that a workspace sets for the model of this rope."""
     lower, upper = np.array([workspace.lower, workspace.upper], dtype=float)
     if workspace.above_table:
         lower[2] = max(lower[2], body.radius)
@@ -91,12 +90,12 @@ def limits_of(body: Body, workspace: Workspace) -> Limits:
 def feasible(goals: Float[np.ndarray, "B N 3"], limits: Limits) -> Bool[np.ndarray, " B"]:
     """Whether any model of a goal is within the limits, shape (B,).
 
-    That does not depend on the breakpoints: without fixed ends all of them may be in one place,
-    and with fixed ends on the straight line between these, as far along it as along the rope.
+    The answer does not depend on the breakpoints: without fixed ends all of them may coincide;
+    with fixed ends they may lie on the line between the ends, as far along it as along the rope.
 
     Args:
         goals: shape (B, N, 3), metres.
-        limits: what the model must keep to.
+        limits: limits on the model.
     """
     possible = np.full(len(goals), (limits.lower <= limits.upper).all())
     if limits.fixed_ends:
@@ -108,12 +107,12 @@ def feasible(goals: Float[np.ndarray, "B N 3"], limits: Limits) -> Bool[np.ndarr
 
 
 def why_infeasible(body: Body, goal: Float[np.ndarray, "N 3"], workspace: Workspace) -> str:
-    """Which limit leaves a goal that is not `feasible` without a model, and what to do.
+    """Message for a goal that is not `feasible`: the limit that excludes a model, and a remedy.
 
     Args:
         body: a rope.
         goal: shape (N, 3), metres.
-        workspace: what the model must keep to.
+        workspace: limits on the model.
     """
     limits = limits_of(body, workspace)
     if (limits.lower > limits.upper).any():
@@ -163,8 +162,8 @@ def fit_free(
 ) -> Float[np.ndarray, "B K 3"]:
     """Best positions of breakpoints at particles, shape (B, K, 3), metres.
 
-    At particles, W has the rows of the unit matrix, and so its normal matrix no eigenvalue
-    below one: solving with it loses nothing.
+    With breakpoints at particles, W contains the rows of the unit matrix, so its normal matrix
+    has no eigenvalue below one and is well conditioned to solve with.
 
     Args:
         goals: shape (B, N, 3), metres.
@@ -178,16 +177,16 @@ def fit_free(
 
 MAX_ROUNDS = 30  # a rope pulled to three times its length needs 10
 LENGTH_TOLERANCE = 1e-6
-"""Of a segment, relative to its largest length."""
+"""Excess length allowed for a segment, relative to its largest length."""
 
 
 class _Cuts(NamedTuple):
     """Largest lengths of segments along directions.
 
     Attributes:
-        directions: of unit length, shape (B, K - 1, 3).
+        directions: unit vectors, shape (B, K - 1, 3).
         longest: largest lengths, shape (B, K - 1), metres.
-        stiffness: against turns away from the directions, shape (B, K - 1).
+        stiffness: stiffness against rotation away from the directions, shape (B, K - 1).
     """
 
     directions: np.ndarray
@@ -204,17 +203,17 @@ def fit_within(
     """Best positions of breakpoints within limits, for a batch of goals (equation 3).
 
     Every point of a fit is between two breakpoints, so a box that holds the breakpoints holds
-    the whole fit. Without a largest length the axes do not interact: each is a programme of its
-    own. The largest length of a segment, |v| <= L, is taken along its direction d in the fit
-    before, d·v <= L, and fitted again until d stays: then the optimality conditions are those of
-    |v| <= L, and the fit is the best there is. Newton's method needs a handful of rounds for
-    this: with what the length holds back, z, goes a stiffness z / L against turns away from d.
-    Without it the rounds circle around the fit where a goal is much longer than the rope.
+    the whole fit. Without a largest length the axes are independent, with one programme each.
+    Each round replaces the largest length of a segment, |v| <= L, by d·v <= L along its direction
+    d in the previous fit, until d no longer changes: the optimality conditions are then those of
+    |v| <= L, and the fit is optimal. Newton's method needs few rounds: the multiplier z of the
+    length adds a stiffness z / L against rotation away from d. Without that stiffness the rounds
+    circle around the fit where a goal is much longer than the rope.
 
     Args:
         goals: shape (B, N, 3), metres.
         breakpoints: ascending, in particles from 0 to N - 1, shape (B, K).
-        limits: what the model must keep to.
+        limits: limits on the model.
         backend: as for `qp.solve`.
 
     Returns:
@@ -223,7 +222,7 @@ def fit_within(
         Where it is not `SOLVED` the positions are NaN and the distance is infinite.
 
     Raises:
-        ValueError: if a number is not one, or the backend cannot handle the limits.
+        ValueError: if a number is not finite, or the backend cannot handle the limits.
     """
     W = hat_weights(goals.shape[1], breakpoints)
     status = np.where(feasible(goals, limits), qp.SolverStatus.SOLVED, qp.SolverStatus.INFEASIBLE)
@@ -259,20 +258,20 @@ def _solve(
     cuts: _Cuts | None,
     backend: str,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, status and what holds segments back, of one round of `fit_within`.
+    """Positions, status and multipliers of the segments' lengths, of one round of `fit_within`.
 
     Args:
         goals: shape (B, N, 3), metres.
         W: weights, shape (B, N, K).
-        limits: what the model must keep to, but for its length.
-        cuts: what its length must keep to.
+        limits: limits on the model, without its length.
+        cuts: limits on the segments' lengths.
         backend: as for `qp.solve`.
 
     Returns:
         Shapes (B, K, 3), NaN where not solved, (B,) and (B, K - 1).
     """
     batch, _, size = W.shape
-    # One programme for each axis, or one for all three of them.
+    # One programme for each axis, or one for all three axes.
     coupled = cuts is not None
     num_programmes = batch if coupled else 3 * batch
     centre = goals.mean(axis=1, keepdims=True)
@@ -302,7 +301,7 @@ def _solve(
     )
     solution = qp.solve(problem, backend)
     positions = np.swapaxes(solution.x.reshape(batch, 3, size), 1, 2) + centre
-    # A goal is solved if its programmes are, and infeasible if one of them is.
+    # A goal is solved if all its programmes are, and infeasible if one of them is.
     status = solution.status.reshape(batch, -1)
     infeasible = (status == qp.SolverStatus.INFEASIBLE).any(axis=1)
     status = np.where(infeasible, qp.SolverStatus.INFEASIBLE, status.max(axis=1))
@@ -314,9 +313,9 @@ def _solve(
 def _unsettled(
     segments: np.ndarray, longest: np.ndarray, cuts: _Cuts | None
 ) -> Bool[np.ndarray, " B"]:
-    """Whether a fit has a segment too long, or turned while a stiffness was against it."""
+    """Whether a fit has a segment that is too long, or that rotated against its stiffness."""
     room = LENGTH_TOLERANCE * longest
-    # Comparing with NaN is false: what is not solved is not tried again.
+    # Comparisons with NaN are false: goals that are not solved are not tried again.
     wrong = np.linalg.norm(segments, axis=2) > longest + room
     if cuts is not None:
         along = np.sum(segments * cuts.directions, axis=2, keepdims=True)
@@ -326,19 +325,19 @@ def _unsettled(
 
 
 def _turning(cuts: _Cuts) -> Float[np.ndarray, "B n n"]:
-    """Hessian of the stiffness against turns."""
+    """Hessian of the stiffness against rotation."""
     d = cuts.directions
     across = np.eye(3) - d[..., :, None] * d[..., None, :]
     rows = _components(across)
-    # `across` is a projection, so its square is itself.
+    # `across` is a projection, so it equals its square.
     return np.einsum("bjxm,bj,bjxn->bmn", rows, cuts.stiffness, rows)
 
 
 def _components(vectors: Float[np.ndarray, "B J M 3"]) -> Float[np.ndarray, "B J M n"]:
-    """Rows that take x, y, z of all breakpoints to components of segments along vectors.
+    """Rows that map x, y, z of all breakpoints to components of segments along vectors.
 
     Args:
-        vectors: of each of J = K - 1 segments M vectors, shape (B, J, M, 3).
+        vectors: M vectors for each of J = K - 1 segments, shape (B, J, M, 3).
     """
     batch, count, number, _ = vectors.shape
     differences = np.diff(np.eye(count + 1), axis=0)

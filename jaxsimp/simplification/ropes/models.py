@@ -1,4 +1,4 @@
-"""Ropes: what every method that fits them does around its fits."""
+"""Ropes: checks, search over sizes and results that all methods for ropes share."""
 
 from collections.abc import Callable
 
@@ -28,11 +28,11 @@ def check_ropes(
         body: a rope.
         goals: goal positions, shape (B, N, 3), metres.
         tolerance: metres; 0.015 of the rope's length by default.
-        max_size: largest number of key points; no more than N are tried.
-        default_max_size: what it is by default.
+        max_size: largest number of key points; at most N are tried.
+        default_max_size: default of `max_size`.
 
     Raises:
-        ValueError: if the body has triangles, a goal is not one of this body, the tolerance is
+        ValueError: if the body has triangles, a goal does not fit the body, the tolerance is
             not above zero, or `max_size` is below 2.
     """
     if len(body.faces):
@@ -55,13 +55,14 @@ def errors_by_size(
     """`smallest_fit` of a batch: errors of the sizes tried, and the first size that fits.
 
     Args:
-        error_fn: errors of the models of a size, metres, for the goals of these indices.
+        error_fn: errors of the models of a size, metres, for the goals with given indices.
         sizes: in ascending order.
         tolerance: metres.
         count: number of goals, `B`.
 
     Returns:
-        Errors, NaN where a size was not tried, and columns of them, `NO_SIZE` where none fits.
+        Errors, NaN where a size was not tried; and for each goal the column of the first size that
+        fits, `NO_SIZE` where none fits.
     """
     errors = np.full((count, len(sizes)), np.nan)
     since_fit = np.zeros(count, dtype=int)
@@ -92,12 +93,12 @@ def rope_models(
         goals: shape (B, N, 3), metres.
         sizes: numbers of key points, `M` of them.
         errors: by size, metres, NaN where a size was not tried.
-        columns: the size that was chosen, `NO_SIZE` where none fits.
+        columns: column of the size that was chosen, `NO_SIZE` where none fits.
         model_fn: particles, breakpoints and positions, shapes (B, K), (B, K) and (B, K, 3), of
-            the models of a size, for the goals of these indices.
-        certified: whether it is proven that no smaller model fits.
+            the models of a size, for the goals with given indices.
+        certified: whether a proof exists that no smaller model fits.
         tolerance: metres.
-        method: what found the models.
+        method: name of the method that found the models.
     """
     tried = np.sum(~np.isnan(errors), axis=1)
     shown = np.where(columns == NO_SIZE, tried - 1, columns)
@@ -134,7 +135,7 @@ def with_infeasible(
     tolerance: float,
     method: str,
 ) -> list[KeyPoints]:
-    """Models of the possible goals, in their places, with nothing where none is possible."""
+    """Models of the feasible goals, and models without key points for the other goals."""
     nothing = KeyPoints(
         particles=np.zeros(0, dtype=int),
         positions=np.zeros((0, 3)),

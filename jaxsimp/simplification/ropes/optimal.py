@@ -1,9 +1,9 @@
 """Ropes: the smallest piecewise-linear fit of all, with the best particles as breakpoints.
 
 Equation 3 of the paper without its evenly spread breakpoints. Dynamic programmes find good fits
-of every size for a batch of goals, and bounds on what any could reach (search.py). Branch
-and bound proves the rest (branch.py). Last come least squares for the positions, or a
-quadratic programme in a workspace (fit.py).
+of every size for a batch of goals, and lower bounds on the errors of all fits (search.py).
+Branch and bound proves the remaining cases (branch.py). Least squares, or a quadratic programme
+in a workspace, give the positions (fit.py).
 """
 
 import numpy as np
@@ -27,7 +27,7 @@ from jaxsimp.simplification.ropes.search import (
 )
 
 NODE_LIMIT = 1_000_000
-"""Chains of segments looked at, for one goal and size, before giving up: about 10 ms."""
+"""Largest number of chains evaluated for one goal and size: about 10 ms."""
 
 
 def simplify_optimal(
@@ -44,27 +44,27 @@ def simplify_optimal(
     The error of a fit is the root mean square distance between particles and fit, sqrt(E / N)
     of equation 3. Where a model is certified, no choice of fewer particles as breakpoints has a
     fit below the tolerance, and no other choice of as many has a better one. Errors of other
-    sizes are those of good fits, which may be above the best.
+    sizes are those of good fits, which may not be optimal.
 
     In a workspace, breakpoints are those of the best free fits, and positions and errors are
-    within the constraints. Certified is then that no fit of fewer breakpoints, free or not, is
-    below the tolerance.
+    within the constraints. A certified model then means that no fit with fewer breakpoints, free
+    or not, is below the tolerance.
 
     Args:
         body: a rope.
         goals: goal positions, shape (B, N, 3), metres.
         tolerance: error below which a fit is accepted, metres; 0.015 of the rope's length
             by default.
-        max_size: largest number of key points tried, 12 by default; no more than N are.
-        workspace: where the model may be; anywhere by default.
-        node_limit: how much branch and bound may look at for one goal and size. Where that is
-            not enough, the model is the best that was found, and not certified.
+        max_size: largest number of key points tried, 12 by default; at most N.
+        workspace: limits on the model; none by default.
+        node_limit: largest number of chains that branch and bound evaluates for one goal and size.
+            Where more are needed, the model is the best found, and not certified.
 
     Returns:
-        One model per goal. Where none fits it is the last one tried.
+        One model per goal: the last one tried where none fits.
 
     Raises:
-        ValueError: if the body has triangles, a goal is not one of this body, the tolerance is
+        ValueError: if the body has triangles, a goal does not fit the body, the tolerance is
             not above zero, or `max_size` is below 2.
     """
     method = "optimal breakpoints"
@@ -104,7 +104,7 @@ def _settle(
     Float[np.ndarray, "B M"],
     Int[np.ndarray, "B M M+1"],
 ]:
-    """The smallest free fits: column of the size, certified, and errors and breakpoints by size.
+    """The smallest free fits: columns of sizes, certificates, errors and breakpoints by size.
 
     Errors are NaN for sizes more than `SIZES_BEYOND` larger than the smallest fit.
     """

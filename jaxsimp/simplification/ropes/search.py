@@ -1,15 +1,15 @@
 """Piecewise-linear fits of ropes with every number of key points, by dynamic programming.
 
-A fit is a chain of segments from particle to particle. The particles of a segment weigh 1, its
-two ends a half each: the other half is the neighbour's. With the ends of the segment at x and y
-its squared error is then
+A fit is a chain of segments from particle to particle. The inner particles of a segment weigh 1,
+its two ends 1/2 each: the other half belongs to the neighbouring segment. With the ends of the
+segment at x and y its squared error is then
 
     C + α |x - X|² + 2 β (x - X)·(y - Y) + α |y - Y|²
 
 where X and Y are the ends of the segment's own regression line, C is the error of that line,
-and α and β depend on the number of particles alone. What the best chain up to a particle costs is
-a|x - c|² + e as a function of the chain's end x, and stays of this form when a segment is added:
-no term is ever subtracted, which is what makes float32 enough. See `_extend`.
+and α and β depend only on the number of particles. The cost of the best chain up to a particle is
+a|x - c|² + e as a function of the chain's end x, and keeps this form when a segment is added. No
+term is subtracted, so float32 suffices. See `_extend`.
 """
 
 from functools import partial
@@ -21,18 +21,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 ROUNDING = 1e-7
-"""Part of the sum of squares that bounds give away, so that float32 cannot raise them."""
+"""Safety margin of the bounds against float32, as a fraction of the sum of squares."""
 BOUND_ROUNDING = 1e-4
-"""How far, relative to itself, a bound in float32 may be above the true one: generous."""
+"""Largest relative excess of a bound in float32 over the exact one: a generous value."""
 CHUNK = 32
-"""Goals at a time: their tables of segments stay in the processor's cache."""
+"""Number of goals per chunk, so that their tables of segments stay in the processor's cache."""
 
 
 class RopeFits(NamedTuple):
     """Fits of a batch of goals with 2, 3, ..., M + 1 key points.
 
     Attributes:
-        bounds: what no fit with breakpoints at particles can be below, root mean square in
+        bounds: lower bound on the error of fits with breakpoints at particles, root mean square in
             metres, shape (B, M).
         free_bounds: the same with breakpoints anywhere, also between particles, shape (B, M).
         errors: error of the fit found, root mean square in metres, shape (B, M).
@@ -57,9 +57,9 @@ def search_batch(goals: Float[np.ndarray, "B N 3"], max_size: int) -> RopeFits:
 
 
 def fill(goals: Float[np.ndarray, "B N 3"]) -> Float[np.ndarray, "B2 N 3"]:
-    """Goals, centred, as a batch of a power of two: few batch sizes are compiled.
+    """Goals, centred, in a batch whose size is a power of two: few batch sizes are compiled.
 
-    They are centred before the default float32 rounds their distance from the origin away.
+    Centred before the conversion to float32, which would round coordinates far from the origin.
 
     Args:
         goals: shape (B, N, 3), metres.
@@ -72,10 +72,11 @@ def fill(goals: Float[np.ndarray, "B N 3"]) -> Float[np.ndarray, "B2 N 3"]:
 def ruled_out(search: RopeFits, tolerance: float) -> Bool[np.ndarray, "B M"]:
     """Whether the bounds prove that no fit of a size is below the tolerance, shape (B, M).
 
-    A model of K key points is then proven smallest, without branch and bound, by [:, K - 3].
+    Entry [:, K - 3] thus proves, without branch and bound, that a model of K key points is the
+    smallest.
 
     Args:
-        search: of a batch.
+        search: the fits of a batch.
         tolerance: root mean square, metres.
     """
     bounds = np.maximum(search.bounds, search.free_bounds)
@@ -84,13 +85,14 @@ def ruled_out(search: RopeFits, tolerance: float) -> Bool[np.ndarray, "B M"]:
 
 @partial(jax.jit, static_argnames="max_size")
 def search(goals: Float[Array | np.ndarray, "B N 3"], max_size: int) -> RopeFits:
-    """Good fits of each number of key points up to `max_size`, and how good any could be.
+    """Good fits of each number of key points up to `max_size`, and lower bounds on all fits.
 
-    The fits keep, for every particle, the one cheapest chain that ends there. That is not exact,
-    since the next segment may prefer another one, but seldom far off: `branch` settles it.
+    The fits keep, for every particle, the one cheapest chain that ends there. This is an
+    approximation, since another chain may be cheaper with the next segment; it is seldom far off,
+    and `branch` makes it exact.
 
     The bounds keep, for every particle, a paraboloid below the costs of all chains that end
-    there. The free bounds leave out that segments meet: the particles of any fit fall into
+    there. The free bounds drop the condition that segments meet: the particles of any fit form
     consecutive runs, one for each segment, and no segment is nearer to its run than the run's
     own regression line.
 
@@ -104,7 +106,7 @@ def search(goals: Float[Array | np.ndarray, "B N 3"], max_size: int) -> RopeFits
 
 def _search_one(points: Array, max_size: int) -> RopeFits:
     count, most = len(points), max_size - 1
-    points = points.T  # x, y, z first: sums over a last axis of three are slow
+    points = points.T  # x, y, z first: sums over a last axis of length three are slow
     runs, _, _ = _line_table(points, regression_gains(count, 1.0, 1.0))
     # A run may be a single particle; a segment has two.
     free = _cheapest_runs(jnp.where(jnp.eye(count, dtype=bool), 0.0, runs), most)
@@ -116,18 +118,18 @@ def _search_one(points: Array, max_size: int) -> RopeFits:
 
 
 def regression_gains(count: int, first: float, last: float) -> Float[np.ndarray, "2 N 3"]:
-    """How a line is updated by one more point: recursive least squares, for times 0, 1, 2, ...
+    """Gains of recursive least squares for a line, at times 0, 1, 2, ...
 
-    A point off the line by `r` at time t adds gain[0] r to the line's value at time 0,
-    gain[1] r to its slope, and gain[2] r² to its squared error.
+    A point with residual `r` at time t adds gain[0] r to the line's value at time 0, gain[1] r to
+    its slope, and gain[2] r² to its squared error.
 
     Args:
         count: number of points.
         first: weight of the first point.
-        last: weight of the last one; those between weigh 1.
+        last: weight of the last point; inner points weigh 1.
 
     Returns:
-        Gains at time t, for a point between ([0]) and for the last one ([1]).
+        Gains at time t, for an inner point ([0]) and for the last one ([1]).
     """
     gains = np.zeros((2, count, 3))
     normal = np.array([[first + 1.0, 1.0], [1.0, 1.0]])  # of the first two points
@@ -155,7 +157,7 @@ def segment_stiffness(count: int) -> Float[np.ndarray, "2 N"]:
 def _line_table(points: Array, gains: np.ndarray) -> tuple[Array, Array, Array]:
     """Regression lines of all runs of particles i..j: their errors and ends, by [i, j].
 
-    The error is infinite where j <= i. Lines of all starts grow at once, point by point.
+    The error is infinite where j <= i. The lines of all starts grow in parallel, point by point.
     """
     count = points.shape[1]
 
@@ -174,7 +176,7 @@ def _line_table(points: Array, gains: np.ndarray) -> tuple[Array, Array, Array]:
     times = jnp.arange(2, count)
     between, last = jnp.asarray(gains[:, 2:], points.dtype)
     _, longer = jax.lax.scan(grow, pair, (times, between, last))
-    # By length and start; runs that wrap around the end are never looked up.
+    # By length and start; runs that wrap around the end are never used.
     tables = jax.tree.map(
         lambda short, long: jnp.concatenate([short[None], long]),
         (pair[2], points, following),
@@ -189,7 +191,7 @@ def _line_table(points: Array, gains: np.ndarray) -> tuple[Array, Array, Array]:
 
 
 def _cheapest_runs(runs: Array, most: int) -> Array:
-    """Lowest total error of 1, 2, ..., `most` runs that share all particles among them."""
+    """Lowest total error of 1, 2, ..., `most` runs that together contain all particles."""
 
     def add(costs: Array, _: None) -> tuple[Array, Array]:
         before = jnp.concatenate([jnp.full(1, jnp.inf, costs.dtype), costs[:-1]])
@@ -217,7 +219,7 @@ def _segment_table(points: Float[Array, "3 N"]) -> _Segments:
 
 
 class _Chains(NamedTuple):
-    """Costs stiffness |x - centre|² + cost of the chains to a particle, by where they end, x."""
+    """Costs stiffness |x - centre|² + cost of the chains to a particle; x is the chain's end."""
 
     stiffness: Float[Array, "*N"]
     centre: Float[Array, "3 *N"]
@@ -227,7 +229,7 @@ class _Chains(NamedTuple):
 def _chains(
     points: Array, segments: _Segments, most: int, below_all: bool
 ) -> tuple[Float[Array, " M"], Int[Array, "M N"]]:
-    """Costs of chains of 1, ..., `most` segments, and where a chain's last segment starts.
+    """Costs of chains of 1, ..., `most` segments, and the start of each chain's last segment.
 
     Args:
         points: shape (3, N).
@@ -245,7 +247,7 @@ def _chains(
         kept = _Chains(*(each[..., best, np.arange(count)] for each in longer))
         if below_all:
             kept = _below(longer, kept, margin)
-        # The other half of the last particle.
+        # The second half of the last particle's weight.
         a, c, e = (each[..., -1] for each in kept)
         closed = e + 0.5 * a / (0.5 + a) * jnp.sum((c - points[:, -1]) ** 2)
         return kept, (jnp.maximum(closed, 0.0), best)
@@ -256,14 +258,14 @@ def _chains(
 
 
 def _first_lowest(costs: Float[Array, "N N"]) -> Int[Array, " N"]:
-    """The first row with the lowest cost, for each column: `argmin`, four times as fast here."""
+    """The first row with the lowest cost, for each column: four times as fast as `argmin` here."""
     rows = jnp.arange(len(costs))[:, None]
     lowest = costs == jnp.min(costs, axis=0, keepdims=True)
     return jnp.min(jnp.where(lowest, rows, len(costs) - 1), axis=0)
 
 
 def _extend(chains: _Chains, segments: _Segments) -> _Chains:
-    """Chains to each particle i made longer by each segment i..j, by [i, j]."""
+    """Chains to each particle i, extended by each segment i..j, by [i, j]."""
     a, e, alpha, beta = chains.stiffness[:, None], chains.cost[:, None], *segments[3:]
     off = chains.centre[:, :, None] - segments.first
     share = a / (alpha * (a + alpha) - beta**2)
@@ -283,7 +285,7 @@ def _below(longer: _Chains, cheapest: _Chains, margin: Array) -> _Chains:
     """
     apart = jnp.sum((longer.centre - cheapest.centre[:, None]) ** 2, axis=0)
     dearer = longer.cost - cheapest.cost[None] + margin
-    # Where no chain reaches a particle nothing matters: its cost is infinite.
+    # Where no chain reaches a particle the cost is infinite, and the other numbers are unused.
     reached = jnp.isfinite(longer.cost)
     softness = 1.0 / longer.stiffness + apart / jnp.where(reached, dearer, 1.0)
     softest = jnp.max(jnp.where(reached, softness, 0.0), axis=0)
@@ -292,7 +294,7 @@ def _below(longer: _Chains, cheapest: _Chains, margin: Array) -> _Chains:
 
 
 def _trace_back(pointers: Int[Array, "M N"]) -> Int[Array, "M M+1"]:
-    """Breakpoints of the chains of every number of segments, from where segments start."""
+    """Breakpoints of the chains of every number of segments, from the starts of segments."""
     most, count = pointers.shape
     sizes = jnp.arange(most)
 

@@ -1,8 +1,8 @@
-"""Ropes: piecewise-linear fits with more and more key points, until one is close to the goal.
+"""Ropes: piecewise-linear fits with an increasing number of evenly spread key points.
 
 Equation 3 of the paper, with breakpoints spread evenly along the rope: a fit is a quadratic
 programme in the positions of the key points. The parameter of particle i of N is
-(i - 1) / (N - 1), not the i / N of the paper's text, which would miss even a perfect V.
+(i - 1) / (N - 1), not the i / N of the paper's text, which would not fit even an exact V.
 """
 
 from functools import partial
@@ -34,24 +34,24 @@ def simplify_uniform(
 ) -> list[KeyPoints]:
     """Key points of ropes: the fewest evenly spread breakpoints that fit the goal.
 
-    Sizes are tried from 2 up, every one: the error is not monotone in the number of evenly
-    spread breakpoints (a V is exact with 3, and not with 4). The key particles are those at
-    the breakpoints of the smallest fit. Its error is the root mean square distance between
-    particles and fit, sqrt(E / N) of equation 3: it orders fits as E does.
+    Tries every size from 2 up: the error is not monotone in the number of evenly spread
+    breakpoints (a V is exact with 3, and not with 4). The key particles are those at the
+    breakpoints of the smallest fit. Its error is the root mean square distance between particles
+    and fit, sqrt(E / N) of equation 3, which orders fits as E does.
 
     Args:
         body: a rope.
         goals: goal positions, shape (B, N, 3), metres.
         tolerance: error below which a fit is accepted, metres; 0.015 of the rope's length
             by default.
-        max_size: largest number of key points tried, 20 by default; no more than N are.
-        workspace: where the model may be; anywhere by default.
+        max_size: largest number of key points tried, 20 by default; at most N.
+        workspace: limits on the model; none by default.
 
     Returns:
-        One model per goal, never certified. Where none fits it is the last one tried.
+        One model per goal, never certified: the last one tried where none fits.
 
     Raises:
-        ValueError: if the body has triangles, a goal is not one of this body, the tolerance is
+        ValueError: if the body has triangles, a goal does not fit the body, the tolerance is
             not above zero, or `max_size` is below 2.
     """
     method = "uniform breakpoints"
@@ -97,8 +97,8 @@ def fit_rope(
     """Best positions of evenly spread breakpoints, for a batch of goals (equation 3).
 
     The closed form of the unconstrained problem: one product with a pseudo-inverse that is
-    known when the function is compiled. Goals are centred before, so that float32 errs by
-    rounding of the rope's extent, not of its distance from the origin.
+    constant when the function is compiled. Centred goals keep the float32 rounding relative to
+    the rope's extent, not to its distance from the origin.
 
     Args:
         goals: shape (B, N, 3), metres.
@@ -154,8 +154,8 @@ def interpolation_matrix(num_particles: int, size: int) -> Float[np.ndarray, "N 
 def breakpoint_particles(num_particles: int, size: int) -> Int[np.ndarray, " K"]:
     """Ids of the particles nearest to evenly spread breakpoints along the rope, shape (K,).
 
-    Nearest by id: on a goal that crosses itself the nearest in space may be another part of
-    the rope.
+    Nearest by id: on a goal that crosses itself the particle nearest in space may belong to
+    another part of the rope.
 
     Args:
         num_particles: number of particles, `N`.

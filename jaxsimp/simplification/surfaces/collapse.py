@@ -1,8 +1,8 @@
 """Compiled: quadric edge collapse in goal and rest coordinates together.
 
 Quadrics in more than three dimensions: Garland & Heckbert, "Simplifying surfaces with color
-and texture using quadric error metrics", 1998. With the rest coordinates among them layers
-that coincide in the goal stay apart, and noise cannot turn a triangle over unseen.
+and texture using quadric error metrics", 1998. The rest coordinates keep layers apart that
+coincide in the goal, and show where noise turns a triangle over.
 """
 
 import heapq
@@ -15,13 +15,13 @@ from numba import njit
 from jaxsimp.simplification.surfaces.model import LinkedMesh, Points, Triangles, Vector
 
 DIMENSIONS = 6  # goal x, y, z and rest x, y, z
-LEAST_HEIGHT = 1e-3  # of a triangle at rest, relative to its longest edge
-THIN = 1e-6  # sine of an angle that is as good as none
-SAME = 1e-14  # squared distances that differ by less are equal: more than rounding, at size 1
-LENGTH_WEIGHT = 1e-9  # of an edge's squared length in its price: decides where quadrics are zero
+LEAST_HEIGHT = 1e-3  # least height of a triangle at rest, relative to its longest edge
+THIN = 1e-6  # sine of an angle below which a triangle is degenerate
+SAME = 1e-14  # squared distances that differ by less are equal: above rounding at size 1
+LENGTH_WEIGHT = 1e-9  # weight of an edge's squared length in its price: decides at zero quadrics
 
-# Numba recompiles what is kept on disk when its own file changes, not when a file it calls does:
-# after a change here delete the .nbi and .nbc files in `__pycache__`.
+# Numba recompiles a cached function when its own file changes, not when a file that it calls
+# changes: after a change here delete the .nbi and .nbc files in `__pycache__`.
 compiled = njit(cache=True, nogil=True)
 Ids = Int[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "7 7"]
@@ -42,16 +42,16 @@ def decimate(
 
     Args:
         points: goal and rest coordinates, shape (N, 6), scaled alike.
-        quadrics: squared distances that each vertex stands for, as functions of a point with a
-            1 behind it, shape (N, 7, 7); changed in place.
+        quadrics: quadric of each vertex, a squared distance as a function of a point in
+            homogeneous coordinates, shape (N, 7, 7); changed in place.
         rest: rest coordinates, shape (N, 3).
         facing: normals at rest, of any length, shape (N, 3).
         faces: particle ids of the triangles, shape (F, 3), consistently oriented.
         size: number of vertices at which to stop.
 
     Returns:
-        Triangles that are left, shape (M, 3), and the one that covers each particle at rest,
-        shape (N,); -1 for a particle of no triangle.
+        Remaining triangles, shape (M, 3), and the index of the triangle that covers each particle
+        at rest, shape (N,); -1 for a particle of no triangle.
     """
     mesh = linked(rest, facing, faces)
     stamps = np.zeros(len(rest), dtype=np.int64)
@@ -84,7 +84,7 @@ def decimate(
 @compiled
 @no_type_check
 def linked(rest: Points, facing: Points, faces: Triangles) -> LinkedMesh:
-    """The mesh with its linked lists; each particle is in one triangle that it is a corner of."""
+    """The mesh with its linked lists; each particle belongs to one of its own triangles."""
     first_corner = np.full(len(rest), -1, dtype=np.int64)
     next_corner = np.full(3 * len(faces), -1, dtype=np.int64)
     first_particle = np.full(len(faces), -1, dtype=np.int64)
@@ -113,7 +113,7 @@ def offer(
     vertex: int,
     around: list[int],
 ) -> None:
-    """Put the collapses of all edges at a vertex, both ways, into the queue."""
+    """Put the collapses of all edges at a vertex, in both directions, into the queue."""
     for other in ring(mesh, vertex, around):
         length = 0.0
         for x in range(DIMENSIONS):
@@ -175,7 +175,7 @@ def ring(mesh: LinkedMesh, vertex: int, around: list[int]) -> list[int]:
 @compiled
 @no_type_check
 def links(mesh: LinkedMesh, gone: int, kept: int) -> bool:
-    """The collapse leaves a surface of the same topology, and no boundary vertex inside."""
+    """Whether the collapse keeps the topology, and boundary vertices on the boundary."""
     around_gone, around_kept = star(mesh, gone), star(mesh, kept)
     ring_gone, ring_kept = ring(mesh, gone, around_gone), ring(mesh, kept, around_kept)
     shared = 0
@@ -186,8 +186,8 @@ def links(mesh: LinkedMesh, gone: int, kept: int) -> bool:
         if other in ring_kept:
             common += 1
             if len(star(mesh, other)) == 3 and len(ring(mesh, other, star(mesh, other))) == 3:
-                return False  # it would be left with two triangles, back to back
-    # A vertex of the boundary stays on it: it may only move along an edge of one triangle.
+                return False  # it would keep only two triangles, back to back
+    # A boundary vertex stays on the boundary: it may only move along an edge of one triangle.
     on_rim = len(ring_gone) != len(around_gone)
     return common == shared and (shared == 1 or not on_rim)
 
@@ -195,7 +195,7 @@ def links(mesh: LinkedMesh, gone: int, kept: int) -> bool:
 @compiled
 @no_type_check
 def keeps_sound(mesh: LinkedMesh, gone: int, kept: int) -> bool:
-    """The collapse leaves triangles, none of them degenerate or turned over at rest."""
+    """Whether the collapse leaves triangles, none of them degenerate or turned over at rest."""
     moving = 0
     for triangle in star(mesh, gone):
         a, b, c = mesh.triangles[triangle]
@@ -212,7 +212,7 @@ def keeps_sound(mesh: LinkedMesh, gone: int, kept: int) -> bool:
 @compiled
 @no_type_check
 def normal_at(rest: Points, a: int, b: int, c: int) -> tuple[Vector, float]:
-    """Normal of a triangle, twice its area long, and its longest edge squared."""
+    """Normal of a triangle, of length twice its area, and its longest edge squared."""
     first, second, third = 0.0, 0.0, 0.0
     for x in range(3):
         first += (rest[b, x] - rest[a, x]) ** 2
@@ -227,7 +227,7 @@ def normal_at(rest: Points, a: int, b: int, c: int) -> tuple[Vector, float]:
 @compiled
 @no_type_check
 def is_sound(rest: Points, a: int, b: int, c: int, reference: Vector) -> bool:
-    """A triangle has some height at rest, and looks where the reference looks."""
+    """Whether a triangle has some height at rest, and faces the same way as the reference."""
     normal, longest = normal_at(rest, a, b, c)
     squared = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
     along = normal[0] * reference[0] + normal[1] * reference[1] + normal[2] * reference[2]
@@ -237,7 +237,7 @@ def is_sound(rest: Points, a: int, b: int, c: int, reference: Vector) -> bool:
 @compiled
 @no_type_check
 def collapse(mesh: LinkedMesh, gone: int, kept: int) -> None:
-    """Move `gone` onto `kept`, and put the particles around it into the triangles that stay."""
+    """Move `gone` onto `kept`, and assign the particles around it to the remaining triangles."""
     around = star(mesh, gone)
     particles, stay = [0][:0], [0][:0]
     for triangle in around:
@@ -255,7 +255,7 @@ def collapse(mesh: LinkedMesh, gone: int, kept: int) -> None:
             if corners[c] == gone:
                 corners[c] = kept
                 mesh.next_corner[3 * triangle + c] = -1
-    # The corners that moved go to the front of the list of `kept`.
+    # Put the corners that moved at the front of the list of `kept`.
     mesh.first_corner[gone] = -1
     for triangle in stay:
         for c in range(3):
@@ -273,21 +273,21 @@ def collapse(mesh: LinkedMesh, gone: int, kept: int) -> None:
 def nearest_triangle(
     rest: Points, facing: Points, particle: int, corners: Triangles, candidates: list[int]
 ) -> tuple[int, Vector, float]:
-    """Of some triangles the nearest to a particle at rest, and the barycentric coordinates.
+    """The nearest of some triangles to a particle at rest, with barycentric coordinates.
 
-    Of those that are equally near one that looks where the particle looks, if there is one: two
-    sides of a body may lie on each other at rest.
+    Of triangles at the same distance, one that faces the same way as the particle, if any: two
+    sides of a body may coincide at rest.
 
     Args:
         rest: rest coordinates, shape (N, 3).
         facing: normals at the particles at rest, of any length, shape (N, 3).
-        particle: its id.
+        particle: id of the particle.
         corners: particle ids of all triangles, shape (M, 3).
         candidates: ids of the triangles to choose from.
 
     Returns:
-        Triangle id, the coordinates of its point nearest to the particle, and the squared
-        distance of that.
+        Triangle id, barycentric coordinates of its point nearest to the particle, and the squared
+        distance to that point.
     """
     best, least, best_faces = candidates[0], np.inf, False
     weights = (1.0, 0.0, 0.0)
@@ -317,7 +317,7 @@ def nearest_point(
     b: Float[np.ndarray, " 3"],
     c: Float[np.ndarray, " 3"],
 ) -> Vector:
-    """Squared distance of a point from a triangle, and coordinates of b and c in the nearest."""
+    """Squared distance of a point from a triangle, and weights of b and c at the nearest point."""
     e00, e01, e11, d0, d1, pp = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(3):
         u, v, w = b[i] - a[i], c[i] - a[i], p[i] - a[i]
@@ -325,7 +325,7 @@ def nearest_point(
         d0, d1, pp = d0 + u * w, d1 + v * w, pp + w * w
     determinant = e00 * e11 - e01 * e01
     s, t = e11 * d0 - e01 * d1, e00 * d1 - e01 * d0
-    upright = determinant > THIN**2 * e00 * e11  # else it is as good as its edges
+    upright = determinant > THIN**2 * e00 * e11  # otherwise treated as its edges
     if upright and s >= 0 and t >= 0 and s + t <= determinant:
         s, t = s / determinant, t / determinant
         inside = pp - s * d0 - t * d1
@@ -349,7 +349,7 @@ def nearest_point(
 @compiled
 @no_type_check
 def survivors(mesh: LinkedMesh) -> tuple[Triangles, Ids]:
-    """Triangles that are left, shape (M, 3), and the one of each particle, shape (N,)."""
+    """Remaining triangles, shape (M, 3), and the triangle of each particle, shape (N,)."""
     count = np.sum(mesh.triangles[:, 0] >= 0)
     triangles = np.empty((count, 3), dtype=np.int64)
     owner = np.full(len(mesh.rest), -1, dtype=np.int64)

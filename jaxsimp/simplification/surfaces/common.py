@@ -1,4 +1,4 @@
-"""What the methods for surfaces share: options, normals, the choice by Hausdorff distance."""
+"""Shared by the methods for surfaces: option checks, normals, choice by Hausdorff distance."""
 
 from collections.abc import Iterable, Mapping
 
@@ -17,17 +17,17 @@ DEFAULT_MAX_SIZE = 24
 def check_surfaces(
     body: Body, goals: Float[np.ndarray, "B N 3"], tolerance: float, max_size: int, least: int
 ) -> Float[np.ndarray, "B N 3"]:
-    """Goals as floats, if a method for surfaces can work with them and the options.
+    """Goals as floats, after a check of the arguments of a method for surfaces.
 
     Args:
-        body: must have triangles.
+        body: a body with triangles.
         goals: goal positions, metres, finite for each particle of this body.
-        tolerance: must be above zero, metres.
-        max_size: must be `least` or more.
-        least: the smallest model of the method.
+        tolerance: metres, above zero.
+        max_size: `least` or more.
+        least: size of the method's smallest model.
 
     Raises:
-        ValueError: if one of them does not.
+        ValueError: if an argument is not as stated.
     """
     if len(body.faces) == 0:
         raise ValueError(f"the {body.name} has 0 triangles; give a body with triangles")
@@ -49,23 +49,23 @@ def fewest_vertices(
     tolerance: float,
     method: str,
 ) -> KeyPoints:
-    """Of meshes with vertices among the particles, the smallest that covers the goal.
+    """The smallest mesh that covers the goal, of meshes with vertices among the particles.
 
-    The error is the Hausdorff distance, surface to surface, from samples that are a tenth of the
-    tolerance apart, or an eighth of the body's spacing if that is more: it may be below the true
-    distance by 0.58 of that.
+    The error is the Hausdorff distance, surface to surface, from samples at a spacing of a tenth of
+    the tolerance, or an eighth of the body's spacing if that is more; it may be below the exact
+    distance by 0.58 of the sample spacing.
 
     Args:
         body: a body with triangles.
         goal: goal positions, shape (N, 3), metres.
-        meshes: triangles in particle ids by number of vertices; looked up as `sizes` go.
+        meshes: triangles in particle ids by number of vertices; read one by one as `sizes` yields.
         sizes: numbers of vertices in ascending order.
         tolerance: Hausdorff distance below which a mesh fits, metres.
-        method: what made the meshes.
+        method: name of the method that made the meshes.
 
     Returns:
-        The first mesh that fits; else the status is `NO_FIT` and it is the best of them, which is
-        no key point at all with an infinite error where there are no meshes.
+        The first mesh that fits; otherwise the best mesh, with the status `NO_FIT`. Without any
+        mesh, no key points and an infinite error.
     """
     original = Surface(goal, body.faces)
     sampling = max(tolerance / 10, body.spacing / 8)
@@ -97,12 +97,12 @@ def fewest_vertices(
 
 
 def no_model(body: Body, tolerance: float, method: str) -> KeyPoints:
-    """What a method returns if it has no model at all: no key point, and an infinite error.
+    """The result of a method without any model: no key points, and an infinite error.
 
     Args:
         body: a body with triangles.
         tolerance: error below which a model would fit, metres.
-        method: what found none.
+        method: name of the method.
     """
     return KeyPoints(
         particles=np.zeros(0, dtype=int),
@@ -122,7 +122,7 @@ def no_model(body: Body, tolerance: float, method: str) -> KeyPoints:
 def rest_normals(
     rest: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Float[np.ndarray, "F 3"]:
-    """Normals of triangles at rest, as long as the triangles are large, shape (F, 3).
+    """Normals of triangles at rest, of length equal to the triangles' areas, shape (F, 3).
 
     Args:
         rest: rest coordinates, shape (N, 3), metres.

@@ -8,14 +8,14 @@ from jaxtyping import Bool, Float
 from jaxsimp.simplification.surfaces.collapse import Ids, compiled, nearest_triangle
 from jaxsimp.simplification.surfaces.model import Points, Sheet, SurfaceModel, Triangles
 
-OUTSIDE_WEIGHT = 10.0  # of squared distances at rest, relative to those in the goal
+OUTSIDE_WEIGHT = 10.0  # weight of squared distances at rest, relative to those in the goal
 Mask = Bool[np.ndarray, " _"]
 
 
 @compiled
 @no_type_check
 def start(sheet: Sheet, vertices: Ids, triangles: Triangles, owner: Ids) -> SurfaceModel:
-    """The model whose triangles cover the particles as given by `owner`, shape (N,)."""
+    """The model whose triangles cover the particles according to `owner`, shape (N,)."""
     weights, sums = np.zeros((len(owner), 3)), np.zeros((len(triangles), 19))
     corners = np.empty_like(triangles)
     for t in range(len(triangles)):
@@ -46,7 +46,7 @@ def tally(
             sums[3 * r + c] += scaled * weights[c]
             sums[9 + 3 * r + c] += scaled * sheet.goal[particle, c]
         sums[18] += area * sheet.goal[particle, r] ** 2
-    # What the model leaves uncovered is an error too, or the outline would shrink.
+    # Particles outside the model's outline at rest add to the error, or the outline would shrink.
     sums[18] += OUTSIDE_WEIGHT * area * outside
 
 
@@ -80,7 +80,7 @@ def solve(
         for k in range(j):
             for i in range(j, size):
                 normal[i, j] -= normal[i, k] * normal[j, k]
-        # A vertex that is gone has a row of zeros.
+        # A removed vertex has a row of zeros.
         pivot = np.sqrt(normal[j, j]) if normal[j, j] > 1e-18 else 1.0
         normal[j, j] = pivot
         for i in range(j + 1, size):
@@ -123,10 +123,10 @@ def distances(
 def changed(
     sheet: Sheet, model: SurfaceModel, vertices: Ids, triangles: Triangles, touched: Mask
 ) -> SurfaceModel:
-    """The model with other vertices and triangles, its particles covered anew.
+    """The model with other vertices and triangles, and its particles assigned again.
 
-    Only particles of the touched triangles are, by those of them that are left: parts of the
-    body that lie on each other at rest stay apart.
+    Only the particles of touched triangles are assigned again, to the touched triangles that
+    remain: parts of the body that coincide at rest stay apart.
     """
     corners = np.full((len(triangles), 3), -1, dtype=np.int64)
     candidates = [0][:0]
@@ -163,7 +163,7 @@ def touching(triangles: Triangles, vertex: int) -> Mask:
 @compiled
 @no_type_check
 def neighbours(triangles: Triangles, vertex: int) -> Ids:
-    """Number of triangles that each vertex shares with one, shape (K,); 0 with itself."""
+    """Number of triangles that each vertex shares with `vertex`, shape (K,); 0 for itself."""
     shared = np.zeros(triangles.max() + 1, dtype=np.int64)
     for t in range(len(triangles)):
         a, b, c = triangles[t]
@@ -188,7 +188,7 @@ def spread(dirty: Mask, triangles: Triangles, vertex: int) -> None:
 @compiled
 @no_type_check
 def has_three(triangles: Triangles, vertex: int) -> bool:
-    """A vertex inside has three triangles: one fewer, and the two would lie back to back."""
+    """Whether an inner vertex has three triangles: one fewer would leave two, back to back."""
     around, ring = 0, 0
     for shared in neighbours(triangles, vertex):
         around += shared

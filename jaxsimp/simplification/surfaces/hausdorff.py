@@ -5,19 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-THIN = 1e-9  # height over longest edge, below which a triangle is treated as that edge
+THIN = 1e-9  # ratio of height to longest edge below which a triangle is treated as that edge
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh in space; triangles without area are segments or points of it.
+    """A triangle mesh in space; triangles without area count as segments or points.
 
     Attributes:
         points: vertex positions, shape (V, 3), metres.
         faces: vertex ids of the triangles, shape (F, 3), at least one.
 
     Raises:
-        ValueError: if an array cannot be part of a mesh.
+        ValueError: if an array is not valid for a mesh.
     """
 
     points: Float[np.ndarray, "V 3"]
@@ -36,13 +36,13 @@ class Surface:
 
 
 def hausdorff_distance(first: Surface, second: Surface, spacing: float) -> float:
-    """Hausdorff distance of two surfaces: the farthest that a point of one is from the other.
+    """Hausdorff distance of two surfaces: the largest distance of a point of one from the other.
 
-    Distances from a sample to the other surface are exact; only the points they start from
-    are sampled. No point of a surface is farther than `spacing / sqrt(3)` from a sample, so
-    the result lies between the true distance less `spacing / sqrt(3)` and the true distance.
-    Vertices are samples, so distances reached at vertices are exact. Layers that cover
-    each other count as one surface: a set distance cannot see that one of them is missing.
+    Distances from a sample to the other surface are exact; only their starting points are
+    sampled. No point of a surface is farther than `spacing / sqrt(3)` from a sample, so the
+    result lies between the exact distance less `spacing / sqrt(3)` and the exact distance.
+    Vertices are samples, so distances reached at vertices are exact. Layers that cover each other
+    count as one surface: the distance of sets does not show that one of them is missing.
 
     Args:
         first: a surface, metres.
@@ -65,7 +65,7 @@ def sample_surface(surface: Surface, spacing: float) -> Float[np.ndarray, "P 3"]
     a triangle is at most its longest edge over sqrt(3) from the nearest vertex.
 
     Args:
-        surface: what is sampled.
+        surface: the surface to sample.
         spacing: longest edge of the small triangles, metres.
 
     Raises:
@@ -106,8 +106,8 @@ def _farthest(samples: np.ndarray, surface: Surface) -> float:
 def _without_slivers(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Triangles, with those of rounded height zero replaced by their longest edges (a, b, b).
 
-    libigl takes such an edge for a segment, but projects onto the plane of a triangle whose
-    normal is all rounding, and then errs by a good part of the triangle's size.
+    libigl treats such an edge as a segment, but projects onto the plane of a sliver, whose normal
+    is only rounding, with an error of the order of the triangle's size.
     """
     corners = points[faces]
     edges = np.roll(corners, -1, axis=1) - corners

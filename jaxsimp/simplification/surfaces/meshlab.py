@@ -1,7 +1,7 @@
-"""Surfaces: MeshLab's own quadric edge collapse, the tool that the paper used.
+"""Surfaces: quadric edge collapse in MeshLab, the paper's tool.
 
-An optional extra, since pymeshlab is under the GPL: it is imported when called. Every call
-passes every parameter: MeshLab takes what is left out from the call before.
+An optional extra, since pymeshlab is under the GPL; the import happens at the call. Every call
+passes every parameter: MeshLab takes missing ones from the previous call.
 """
 
 from collections.abc import Iterator
@@ -42,9 +42,9 @@ def simplify_meshlab(
 ) -> list[KeyPoints]:
     """Key points of goals of a surface: the vertices of the smallest mesh that covers each.
 
-    The goal is decimated to two triangles, three and so on, as in section III-A.2 of the paper,
-    until the Hausdorff distance is below the tolerance (see `fewest_vertices`). MeshLab may
-    leave more triangles than it was asked for.
+    MeshLab decimates the goal to two triangles, three and so on, as in section III-A.2 of the
+    paper, until the Hausdorff distance is below the tolerance (see `fewest_vertices`). It may
+    leave more triangles than requested.
 
     Arguments and result are those of `simplify_quadric`.
 
@@ -67,16 +67,16 @@ def simplify_meshlab(
 def decimate(
     pymeshlab: ModuleType, points: Positions, faces: Int[np.ndarray, "F 3"], num_triangles: int
 ) -> Int[np.ndarray, "_ 3"]:
-    """MeshLab's mesh of about so many triangles, in the vertex ids of `faces`.
+    """MeshLab's mesh of about `num_triangles` triangles, in the vertex ids of `faces`.
 
     Args:
         pymeshlab: the library.
         points: vertex positions, shape (V, 3), metres.
         faces: vertex ids of the triangles, shape (F, 3).
-        num_triangles: number of triangles asked for.
+        num_triangles: number of triangles requested.
     """
     meshes = pymeshlab.MeshSet(verbose=False)
-    # Ids travel as a scalar at each vertex; a float64 holds every one of them exactly.
+    # Ids are stored as a scalar at each vertex; a float64 holds each of them exactly.
     ids = np.arange(len(points), dtype=float)
     meshes.add_mesh(pymeshlab.Mesh(points, faces, v_scalar_array=ids))
     meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=num_triangles, **PARAMETERS)
@@ -92,13 +92,13 @@ def _decimations(
     max_size: int,
     meshes: dict[int, np.ndarray],
 ) -> Iterator[int]:
-    """Numbers of vertices from more and more triangles, each once; the mesh is put in `meshes`."""
+    """Increasing numbers of vertices, each once; stores the mesh of each in `meshes`."""
     for num_triangles in range(MIN_TRIANGLES, len(faces) + 1):
         triangles = decimate(pymeshlab, goal, faces, num_triangles)
         size = len(np.unique(triangles))
         if size > max_size:
             return
-        # Sizes must ascend: of as many vertices as before, or fewer, the first mesh stands.
+        # Sizes must ascend: a mesh with no more vertices than an earlier one is skipped.
         if size > max(meshes, default=0):
             meshes[size] = triangles
             yield size

@@ -1,4 +1,4 @@
-"""What the compiled functions of the rest-aware collapse work on: plain tuples of arrays."""
+"""Data of the compiled functions of the rest-aware collapse: plain tuples of arrays."""
 
 from typing import NamedTuple
 
@@ -11,13 +11,13 @@ Vector = tuple[float, float, float]
 
 
 class Sheet(NamedTuple):
-    """A body and its goal, in lengths of the body's own size: what models are compared with.
+    """A body and its goal, in units of the body's size; models are compared with these.
 
     Attributes:
         rest: rest coordinates, shape (N, 3), centred.
         facing: normals at rest, of any length, shape (N, 3).
         goal: goal positions, shape (N, 3), centred.
-        area: of each particle at rest, its weight, shape (N,), summing to 1.
+        area: area of each particle at rest, its weight, shape (N,), summing to 1.
         first: particle i has the neighbours `other[first[i] : first[i + 1]]`, shape (N + 1,).
         other: particle ids, shape (2 E,).
         rim: neighbours along the boundary, shape (N, 2); -1 for a particle inside.
@@ -36,12 +36,12 @@ class SurfaceModel(NamedTuple):
     """A piecewise-linear surface: triangles of particles that cover the body at rest.
 
     Attributes:
-        vertices: particle ids, shape (K,); -1 for one that is gone.
-        triangles: indices into `vertices`, shape (M, 3); -1 for one that is gone.
+        vertices: particle ids, shape (K,); -1 for a removed one.
+        triangles: indices into `vertices`, shape (M, 3); -1 for a removed one.
         owner: triangle of each particle, shape (N,); -1 for a particle of no triangle.
         weights: barycentric coordinates of each particle in its triangle, shape (N, 3).
-        sums: of the particles of each triangle, shape (M, 19): their part of the normal equations
-            of the fit, see `tally`.
+        sums: sums over the particles of each triangle, shape (M, 19): their part of the normal
+            equations of the fit, see `tally`.
     """
 
     vertices: Int[ndarray, " K"]
@@ -60,11 +60,11 @@ class LinkedMesh(NamedTuple):
     Attributes:
         rest: rest coordinates, shape (N, 3).
         facing: normals at rest, of any length, shape (N, 3).
-        triangles: particle ids, shape (F, 3); -1 for one that is gone.
-        first_corner: of each vertex, shape (N,).
-        next_corner: of the same vertex, shape (3 F,).
-        first_particle: of each triangle, shape (F,).
-        next_particle: of the same triangle, shape (N,).
+        triangles: particle ids, shape (F, 3); -1 for a removed one.
+        first_corner: first corner of each vertex, shape (N,).
+        next_corner: next corner of the same vertex, shape (3 F,).
+        first_particle: first particle of each triangle, shape (F,).
+        next_particle: next particle of the same triangle, shape (N,).
     """
 
     rest: Points

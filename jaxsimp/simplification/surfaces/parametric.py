@@ -1,10 +1,10 @@
-"""Surfaces: the fewest triangles, in rest coordinates, that take every particle to its goal.
+"""Surfaces: the fewest triangles, in rest coordinates, that map every particle to its goal.
 
 Rest-aware collapse. A quadric edge collapse in goal and rest coordinates together leaves about
-two dozen vertices, all of them particles. Then vertices are removed one by one, and the others
-moved to neighbouring particles and edges flipped, while a least-squares fit of the model to
-all particles gets better. The fit averages over noise; layers that lie on each other are far
-apart at rest, so they are never mistaken for one.
+two dozen vertices, all of them particles. Then vertices are removed one by one; the others move
+to neighbouring particles, and edges flip, while this improves a least-squares fit of the model to
+all particles. The fit averages over noise; layers that coincide in the goal are far apart at
+rest, so the fit does not confuse them.
 """
 
 import os
@@ -27,13 +27,13 @@ from jaxsimp.simplification.surfaces.model import Sheet, SurfaceModel
 
 METHOD = "rest-aware collapse"
 MIN_SIZE = 3  # one triangle
-START_SIZE = 24  # vertices that the collapse leaves, at least
-TOLERANCE = 0.1  # of the side of a square of the body's area
+START_SIZE = 24  # least number of vertices after the collapse
+TOLERANCE = 0.1  # as a fraction of the side of a square of the body's area
 # Removals whose largest distance is below this part of the tolerance are compared by their mean
 # square distance alone: the largest of many small distances is noise.
 ENOUGH = 0.5
-BOUNDARY_WEIGHT = 10.0  # of a boundary edge, times its squared length; a triangle weighs its area
-LONGEST_MOVE = 1 / 6  # of the particles along a side
+BOUNDARY_WEIGHT = 10.0  # times the squared length of a boundary edge; a triangle weighs its area
+LONGEST_MOVE = 1 / 6  # as a fraction of the particles along a side
 
 
 def simplify_parametric(
@@ -49,23 +49,23 @@ def simplify_parametric(
     least-squares fit to all particles, weighted by their area, and not the goals of the key
     particles: a fit averages over noise. No model is proven to be the smallest.
 
-    Works for any manifold with or without boundary, planar at rest or not. Goals are
-    independent of each other and run in threads. The first call compiles for about half a
-    minute; the result is kept on disk.
+    Works for any manifold with or without boundary, planar at rest or not. Goals are independent
+    and run in threads. The first call compiles for about half a minute; numba keeps the compiled
+    code on disk.
 
     Args:
-        body: a body with triangles; particles of none are left out of account.
+        body: a body with triangles; particles of no triangle are ignored.
         goals: goal positions, shape (B, N, 3), metres.
         tolerance: error below which a model fits, metres; by default a tenth of the side of a
-            square that is as large as the body.
+            square of the body's area.
         max_size: largest number of key points tried; 24 by default.
 
     Returns:
-        Key points of each goal. Where no model of up to `max_size` key points fits the status is
-        `NO_FIT` and it is the best of them.
+        Key points of each goal: the best of the models tried, with the status `NO_FIT`, where no
+        model of up to `max_size` key points fits.
 
     Raises:
-        ValueError: if the body has no triangles, a goal is not one of this body, the tolerance
+        ValueError: if the body has no triangles, a goal does not fit the body, the tolerance
             is not above zero, or `max_size` is below 3.
     """
     scale = float(np.sqrt(np.linalg.norm(rest_normals(body.rest, body.faces), axis=1).sum()))
@@ -84,7 +84,7 @@ def simplify_parametric(
 
 
 def _sheet(body: Body, goal: Positions, scale: float) -> Sheet:
-    """Body and goal as the compiled functions take them, in lengths of `scale`."""
+    """Body and goal as input of the compiled functions, in units of `scale`."""
     count, faces = body.num_particles, body.faces
     normals = rest_normals(body.rest / scale, faces)
     area, facing = np.zeros(count), np.zeros((count, 3))
@@ -106,7 +106,7 @@ def _sheet(body: Body, goal: Positions, scale: float) -> Sheet:
 def _models(
     sheet: Sheet, faces: Int[np.ndarray, "F 3"], size: int, tolerance: float
 ) -> dict[int, SurfaceModel]:
-    """Models of all sizes, by size: from `size`, where the mesh has as many, down."""
+    """Models by size, from that of the collapsed mesh (`size` where possible) down."""
     from jaxsimp.simplification.surfaces import collapse, fit, refine
 
     points = np.concatenate([sheet.goal, sheet.rest], axis=1)
@@ -130,9 +130,9 @@ def _models(
 
 
 def _without_gaps(model: SurfaceModel) -> SurfaceModel:
-    """The model without the rows of what is gone."""
+    """The model without the rows of removed vertices and triangles."""
     vertices, triangles = model.vertices >= 0, model.triangles[:, 0] >= 0
-    # What refers to nothing, -1, finds the -1 at the end.
+    # An index of -1, which refers to nothing, reads the -1 at the end.
     vertex_number = np.append(np.cumsum(vertices) - 1, -1)
     triangle_number = np.append(np.cumsum(triangles) - 1, -1)
     return model._replace(
@@ -146,10 +146,10 @@ def _without_gaps(model: SurfaceModel) -> SurfaceModel:
 def _outline(
     rest: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "F 3"]
 ) -> Int[np.ndarray, "E 3"]:
-    """Edges where the body ends at rest and the third vertex of their triangles, shape (E, 3).
+    """Edges of the body's outline at rest, and the third vertex of their triangles, shape (E, 3).
 
     Besides the boundary these are edges where the body turns back on itself, as a flat shirt
-    does at its sides: there are two triangles at each.
+    does at its sides, with two triangles at each.
     """
     edges, owner = boundary_edges(faces)
     apex = faces[owner].sum(axis=1) - edges.sum(axis=1)
@@ -169,8 +169,8 @@ def _quadrics(
 ) -> Float[np.ndarray, "N 7 7"]:
     """Squared distances from the planes of each vertex's triangles and from its outline.
 
-    As functions of a point with a 1 behind it. A triangle's plane counts by its area. An edge of
-    the outline adds the distance from it within the plane of its triangle.
+    Functions of a point in homogeneous coordinates. A triangle's plane is weighted by its area. An
+    edge of the outline adds the distance from it within the plane of its triangle.
     """
     quadrics = np.zeros((len(points), 7, 7))
     along, across, area = _frames(points[faces])
@@ -214,7 +214,7 @@ def _add_quadrics(
 
 
 def _steps(num_particles: int) -> Int[np.ndarray, " L"]:
-    """Lengths of moves in particles, longest first: powers of two."""
+    """Lengths of moves, in particles, longest first: powers of two."""
     longest = max(1.0, LONGEST_MOVE * np.sqrt(num_particles))
     return 2 ** np.arange(int(np.log2(longest)), -1, -1)
 
@@ -227,7 +227,7 @@ def _smallest(
     scale: float,
     tolerance: float,
 ) -> KeyPoints:
-    """The smallest model that fits, or the best."""
+    """The smallest model that fits, or the best if none fits."""
     from jaxsimp.simplification.surfaces.fit import distances, fit
 
     def error(size: int) -> float:

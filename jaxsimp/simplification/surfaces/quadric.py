@@ -2,7 +2,7 @@
 
 The method of the paper (section III-A.2) with the algorithm behind its tool: quadric edge
 collapse decimation (Garland & Heckbert, "Surface simplification using quadric error
-metrics", 1997). A collapsed vertex keeps the place of one of the two ends (subset
+metrics", 1997). A collapsed vertex keeps the position of one of the two ends (subset
 placement), so that every vertex of the model is a particle of the body.
 """
 
@@ -24,12 +24,12 @@ from jaxsimp.simplification.surfaces.common import (
 
 MIN_SIZE = 4  # two triangles, where the paper starts
 # Weights of the planes of boundary edges and turns, for a mesh scaled to half an extent of 1,
-# in which a triangle's plane weighs its area. Both may be three times smaller or larger: tests
-# of 8 folds on meshes of 12 x 12 to 25 x 25 particles come out the same.
+# in which a triangle's plane weighs its area. With both three times smaller or larger, tests
+# of 8 folds on meshes of 12 x 12 to 25 x 25 particles give the same results.
 BOUNDARY_WEIGHT = 3.0  # times the length of the edge
 TURN_WEIGHT = 0.01
-LEAST_HEIGHT = 1e-3  # of a triangle, relative to its longest edge; one below it is degenerate
-LEAST_GAIN = 0.1  # of strain, for an edge to be replaced; rounding must not decide
+LEAST_HEIGHT = 1e-3  # height of a triangle over its longest edge, below which it is degenerate
+LEAST_GAIN = 0.1  # reduction of strain that replaces an edge; rounding must not decide
 ROUNDING = 1e-10  # quadric errors below this are rounding
 
 
@@ -41,13 +41,13 @@ def simplify_quadric(
 ) -> list[KeyPoints]:
     """Key points of goals of a surface: the vertices of the smallest mesh that covers each.
 
-    A goal's mesh is decimated once, down to four vertices where its topology allows; the
-    sizes on the way are compared with the goal from the smallest up, by the Hausdorff
+    One decimation of a goal's mesh goes down to four vertices where its topology allows; the
+    meshes on the way are compared with the goal from the smallest up, by the Hausdorff
     distance (see `fewest_vertices`).
 
-    Two steps go beyond the paper's tool: `follow_creases` prepares the mesh, and turns of
-    the boundary are held in place like its edges. Without them a fold along the diagonal
-    that the triangles' edges cross gives 5 key points instead of 4 on some meshes.
+    Two steps go beyond the paper's tool: `follow_creases` prepares the mesh, and quadrics hold
+    turns of the boundary in place like its edges. Without them a fold along the diagonal that
+    the triangles' edges cross gives 5 key points instead of 4 on some meshes.
 
     Args:
         body: a body with triangles.
@@ -57,11 +57,11 @@ def simplify_quadric(
         max_size: largest number of key points tried; 24 by default.
 
     Returns:
-        Key points of each goal. Where no mesh of up to `max_size` vertices fits the status is
-        `NO_FIT` and it is the best of them.
+        Key points of each goal: the best of the meshes tried, with the status `NO_FIT`, where no
+        mesh of up to `max_size` vertices fits.
 
     Raises:
-        ValueError: if the body has no triangles, a goal is not one of this body, the tolerance
+        ValueError: if the body has no triangles, a goal does not fit the body, the tolerance
             is not above zero, or `max_size` is below 4.
     """
     tolerance = 0.1 * body.size if tolerance is None else tolerance
@@ -78,10 +78,10 @@ def simplify_quadric(
 def follow_creases(body: Body, goal: Positions) -> Int[np.ndarray, "F 3"]:
     """Triangles of the body with edges along the goal's creases, shape (F, 3).
 
-    A body's triangles know nothing of the goal. Where an edge crosses a crease its ends lie
-    on each other, and its two triangles stand upright between the layers: a wall that no
-    cloth has, and that would hold its vertices. Such an edge is shorter than at rest; it is
-    replaced by the other diagonal of its two triangles where that one keeps its length.
+    A body's triangles do not depend on the goal. Where an edge crosses a crease its ends coincide,
+    and its two triangles stand upright between the layers: a wall that the cloth does not have, and
+    that would hold its vertices. Such an edge is shorter than at rest; the other diagonal of its
+    two triangles replaces it where that one keeps its length.
 
     Args:
         body: a body with triangles.
@@ -110,13 +110,13 @@ def collapse_sequence(
     Each step removes the vertex whose quadric error, divided by the shape of the worst
     triangle that results, is least. A collapse that would change the topology (link
     condition), turn a triangle over or make one degenerate waits until its surroundings
-    change. The sequence ends at four vertices, or earlier where no collapse is left. Equal
-    costs go by edge length, then by vertex id: the result is deterministic.
+    change. The sequence ends at four vertices, or earlier where no collapse is possible. Edge
+    length, then vertex id, decide between equal costs: the result is deterministic.
 
     Args:
         points: vertex positions, shape (V, 3), metres.
         faces: vertex ids of the triangles, shape (F, 3), consistently oriented.
-        max_size: largest mesh that is kept.
+        max_size: number of vertices of the largest mesh to keep.
 
     Returns:
         Triangles of each mesh, in the vertex ids of `faces`.
@@ -132,7 +132,7 @@ def collapse_sequence(
 
 
 class _Collapses:
-    """A mesh under decimation, and the queue of the collapses that it offers."""
+    """A mesh under decimation, and the queue of its possible collapses."""
 
     def __init__(self, points: np.ndarray, faces: np.ndarray) -> None:
         self.points = points
@@ -155,13 +155,13 @@ class _Collapses:
             *_, removed, kept, ticket = heapq.heappop(self.queue)
             if self.latest.get((removed, kept)) != ticket:
                 continue
-            # One that is refused is offered again when its surroundings change.
+            # A collapse that is not sound enters the queue again when its surroundings change.
             if self._links(removed, kept) and self._sound(removed, kept):
                 self._enqueue(self._collapse(removed, kept))
                 yield
 
     def triangles(self) -> np.ndarray:
-        """Triangles of the mesh as it is, shape (F, 3)."""
+        """Triangles of the current mesh, shape (F, 3)."""
         alive = sorted(set().union(*(self.around[vertex] for vertex in self.vertices)))
         return self.faces[alive]
 
@@ -169,7 +169,7 @@ class _Collapses:
         return set(self.faces[list(self.around[vertex])].ravel().tolist()) - {vertex}
 
     def _links(self, removed: int, kept: int) -> bool:
-        """Link condition: the collapse leaves a surface of the same topology."""
+        """Whether the collapse keeps the surface's topology (link condition)."""
         shared = self.around[removed] & self.around[kept]
         if len(self.ring[removed] & self.ring[kept]) != len(shared):
             return False
@@ -177,7 +177,7 @@ class _Collapses:
         return not (inner and self._on_boundary(removed) and self._on_boundary(kept))
 
     def _sound(self, removed: int, kept: int) -> bool:
-        """The collapse leaves triangles, none of them degenerate or turned over."""
+        """Whether the collapse leaves triangles, none of them degenerate or turned over."""
         moving = list(self.around[removed] - self.around[kept])
         if not moving:
             return False
@@ -211,7 +211,7 @@ class _Collapses:
         return changed
 
     def _enqueue(self, vertices: Iterable[int]) -> None:
-        """Offer anew all collapses along the edges at `vertices`."""
+        """Put all collapses along the edges at `vertices` into the queue again."""
         edges = {(v, w) for v in vertices for w in self.ring[v]}
         edges |= {(w, v) for v, w in edges}
         pairs = sorted(edges)
@@ -236,7 +236,7 @@ def _area(points: np.ndarray, quads: np.ndarray) -> np.ndarray:
 
 
 def _strain(rest: np.ndarray, goal: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """How far edges are from their rest lengths, relative to them, shape (E,)."""
+    """Absolute strain of edges: change of length relative to the rest length, shape (E,)."""
     length, rest_length = (
         np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1) for points in (goal, rest)
     )
@@ -246,8 +246,8 @@ def _strain(rest: np.ndarray, goal: np.ndarray, edges: np.ndarray) -> np.ndarray
 def _quadrics(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Sum of the squared distances to the planes that meet at each vertex, shape (V, 4, 4).
 
-    A triangle's plane counts by its area. An edge of the boundary adds the plane through
-    it at right angles to its triangle, so that the boundary keeps its place.
+    A triangle's plane is weighted by its area. A boundary edge adds the plane through it at right
+    angles to its triangle, so that the boundary keeps its place.
     """
     normals, _ = _normals(points[faces])
     area = np.linalg.norm(normals, axis=1) / 2
@@ -266,9 +266,9 @@ def _add_turns(
 ) -> None:
     """Hold a vertex where the boundary turns, in the direction of the turn.
 
-    Where a folded boundary returns on itself, the planes of its edges coincide, and leave
-    the end of the crease free to slide along them. The turn is the sum of the unit vectors
-    that arrive less those that leave: none on a straight boundary, two along at a return.
+    Where a folded boundary returns on itself, the planes of its edges coincide, and leave the end
+    of the crease free to slide along them. The turn is the sum of the unit vectors of incoming
+    edges less those of outgoing edges: zero on a straight boundary, of length two at a return.
     """
     length = np.linalg.norm(along, axis=1, keepdims=True)
     direction = along / np.maximum(length, np.finfo(float).tiny)
@@ -298,7 +298,7 @@ def _add_planes(
 
 
 def _normals(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals of triangles, twice their area long, and their longest edges squared."""
+    """Normals of triangles, of length twice their area, and their longest edges squared."""
     edges = corners[:, [1, 2, 0]] - corners
     x, y = edges[:, 0], edges[:, 1]
     normals = x[:, [1, 2, 0]] * y[:, [2, 0, 1]] - x[:, [2, 0, 1]] * y[:, [1, 2, 0]]

@@ -1,4 +1,4 @@
-"""Compiled: a model of a surface made smaller and better by moves, flips and removals."""
+"""Compiled: moves, flips and removals that make a model of a surface smaller and better."""
 
 from typing import no_type_check
 
@@ -17,21 +17,21 @@ from jaxsimp.simplification.surfaces.fit import (
 )
 from jaxsimp.simplification.surfaces.model import Points, Sheet, SurfaceModel, Triangles
 
-LEAST_GAIN = 1e-4  # of the sum of squares, for a change to be made
-ROUNDING = 1e-12  # of the goal's own sum of squares: differences below it are rounding
+LEAST_GAIN = 1e-4  # least reduction for a change, as a fraction of the sum of squares
+ROUNDING = 1e-12  # rounding, as a fraction of the goal's own sum of squares
 
 
 @compiled
 @no_type_check
 def remove(sheet: Sheet, model: SurfaceModel, enough: float) -> tuple[SurfaceModel, int]:
-    """The best model with a vertex less: one of its edges is collapsed.
+    """The best model with one vertex fewer, by the collapse of an edge.
 
-    Models are compared by their largest distance from the goal, which sees every small part,
+    Models are compared by their largest distance from the goal, which depends on every small part,
     then by their mean square: all distances below `enough` count as equal.
 
     Returns:
-        The model, where vertices and triangles that are gone are -1, and the vertex; -1 and the
-        same model if none can be removed.
+        The model, with -1 for removed vertices and triangles, and the removed vertex; the same
+        model and -1 if no vertex can be removed.
     """
     best, best_gone = model, -1
     best_largest, best_error = np.inf, np.inf
@@ -59,7 +59,7 @@ def remove(sheet: Sheet, model: SurfaceModel, enough: float) -> tuple[SurfaceMod
 def collapsed(
     sheet: Sheet, model: SurfaceModel, gone: int, kept: int, touched: Mask, shared_by: Ids
 ) -> tuple[SurfaceModel, bool]:
-    """The model with a vertex moved onto its neighbour, and whether that is a model."""
+    """The model with a vertex moved onto its neighbour, and whether the result is valid."""
     common = neighbours(model.triangles, kept)
     both = 0
     for vertex in range(len(shared_by)):
@@ -92,12 +92,12 @@ def improve(sheet: Sheet, model: SurfaceModel, dirty: Mask, steps: Ids) -> Surfa
 
     Args:
         sheet: body and goal.
-        model: where to start.
-        dirty: vertices to look at, shape (K,); changed in place.
+        model: initial model.
+        dirty: vertices to try, shape (K,); changed in place.
         steps: lengths of moves, in neighbours, longest first.
     """
     _, error = fit(model)
-    for _ in range(1000):  # the error falls, so it ends; this is a guard against rounding
+    for _ in range(1000):  # the error falls, so the loop ends; the limit guards against rounding
         if True not in dirty:
             break
         for vertex in range(len(dirty)):
@@ -122,7 +122,7 @@ def improve(sheet: Sheet, model: SurfaceModel, dirty: Mask, steps: Ids) -> Surfa
 def best_move(
     sheet: Sheet, model: SurfaceModel, error: float, vertex: int, steps: int
 ) -> tuple[SurfaceModel, float]:
-    """The best move of a vertex by some steps: the model and its error, or what was given."""
+    """The best move of a vertex by some steps: model and error, as given if none is better."""
     touched = touching(model.triangles, vertex)
     best = model
     particle = model.vertices[vertex]
@@ -147,9 +147,9 @@ def best_move(
 @compiled
 @no_type_check
 def walk(sheet: Sheet, particle: int, toward: int, steps: int) -> int:
-    """The particle that lies from `particle` in the direction of a neighbour, `steps` as far.
+    """The particle `steps` steps from `particle` in the direction of the neighbour `toward`.
 
-    A particle of the boundary goes along it, one inside stays inside.
+    A boundary particle moves along the boundary, an inner one stays inside.
     """
     before = particle
     if sheet.rim[particle, 0] >= 0:
@@ -173,7 +173,7 @@ def walk(sheet: Sheet, particle: int, toward: int, steps: int) -> int:
 @compiled
 @no_type_check
 def beyond(rest: Points, particle: int, toward: int, steps: int, candidate: int) -> float:
-    """Squared distance of a candidate from where `steps` steps lead from particle `toward`."""
+    """Squared distance of a candidate from the point `steps` steps from `particle` to `toward`."""
     squared = 0.0
     for x in range(3):
         target = rest[particle, x] + steps * (rest[toward, x] - rest[particle, x])
@@ -238,7 +238,7 @@ def flip(model: SurfaceModel, first: int, second: int) -> tuple[Triangles, bool]
 def all_sound(
     sheet: Sheet, model: SurfaceModel, vertices: Ids, triangles: Triangles, touched: Mask
 ) -> bool:
-    """No touched triangle that is left is degenerate or turned over at rest."""
+    """Whether no remaining touched triangle is degenerate or turned over at rest."""
     for t in range(len(triangles)):
         if touched[t] and triangles[t, 0] >= 0:
             a, b, c = model.triangles[t]
