@@ -224,7 +224,7 @@ def _wrinkles(ideal: IdealGoal, rng: np.random.Generator) -> np.ndarray:
 
 
 def _outliers(ideal: IdealGoal, rng: np.random.Generator) -> np.ndarray:
-    """White noise of a quarter of the level, and of four times the level on 1 in 50 particles."""
+    """White noise of a quarter of the level; 1 particle in 50 is off by 4 times the level."""
     noise = rng.normal(size=ideal.goal.shape) / 4
     far = rng.random(len(noise)) < 0.02
     off = rng.normal(size=noise.shape)

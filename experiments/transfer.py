@@ -226,8 +226,8 @@ class TransferOptions(PlanOptions):
         """
         if self.plans and self.planning != TransferOptions.planning:
             raise ValueError(
-                f"--planning {self.planning} searches for plans, but {self.plans} already holds "
-                f"plans; leave out --planning or --plans"
+                f"--planning {self.planning} finds plans, but {self.plans} already holds plans; "
+                f"leave out --planning or --plans"
             )
         planned = planned_study(self.plans) if self.plans else self.configuration()
         source = str(self.plans) if self.plans else None
