@@ -225,7 +225,7 @@ def _run_all(
             f"{name}: compiled in {compiled[name]:.1f} s; "
             f"{len(left[name])} runs of about {seconds[name] / len(left[name]):.1f} s"
         )
-    console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for what is left")
+    console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for the remaining runs")
     with progress_bar(console) as progress:
         for name, planner in planners.items():
             algorithm, compile_seconds = study.search_config(planner.task), compiled[name]

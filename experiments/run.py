@@ -22,7 +22,7 @@ STUDIES: dict[str, type[StudyOptions]] = {
 
 def main() -> int:
     """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
-    return exit_status(_run, "interrupted; the same command goes on where it was")
+    return exit_status(_run, "interrupted; the same command resumes it")
 
 
 def _run() -> int:

@@ -96,10 +96,10 @@ def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) 
         "Fast: hardly stretches, limp, layers pass through others. Full: elastic as our springs "
         "are, with self-collision and friction between layers.",
         "",
-        "## Plans that were found",
+        "## Plans found by the search",
         *_table(summary["transfer"], study.success_score),
         "",
-        "## Plans that were made by hand",
+        "## Plans made by hand",
         *_table(summary["scripted"], study.success_score),
         "",
         "## Scores in ours and in MuJoCo",

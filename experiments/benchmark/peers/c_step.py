@@ -86,7 +86,7 @@ def _compile(springs: Offsets) -> Callable[..., int]:
         )
     compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
     if compiler is None:
-        raise UnavailableError(f"no C compiler is there ({', '.join(COMPILERS)})")
+        raise UnavailableError(f"no C compiler found ({', '.join(COMPILERS)})")
     macros = (
         f"-DNUM_PARTICLES={springs.stiffness.shape[1]}",
         f"-DHALO={springs.offsets.max()}",

@@ -75,7 +75,7 @@ def make_mjx_simulation(
     if body.num_particles > MOST_PARTICLES:
         raise ValueError(
             f"the {body.name} has {body.num_particles} particles; MJX takes at most "
-            f"{MOST_PARTICLES}, for its steps are slow. Take fewer particles, or our own "
+            f"{MOST_PARTICLES}, as its steps are slow. Take fewer particles, or our own "
             f"dynamics"
         )
     ours = make_simulation(body, time_step, gravity)
