@@ -53,7 +53,7 @@ class Algorithm(Protocol):
 
     @property
     def num_asks(self) -> int:
-        """Number of questions, each for the costs of `num_plans` plans."""
+        """Number of questions, each about `num_plans` plans."""
         ...
 
     @property
