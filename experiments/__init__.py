@@ -1,1 +1,1 @@
-"""Studies that lean on jaxsimp: `python -m experiments.run`."""
+"""Studies with jaxsimp: `python -m experiments.run`."""

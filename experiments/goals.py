@@ -9,9 +9,9 @@ from jaxsimp.tasks import task_names
 
 @dataclass(frozen=True)
 class GoalsOptions(PlanOptions):
-    """Harder goals, planned as the paper's are: letters, folds in sequence, garments.
+    """Plans for harder goals, as for the paper's: letters, folds in sequence, garments.
 
-    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    Stop it with Ctrl-C or kill it at any time: the same command resumes it.
     """
 
     NAME: ClassVar[str] = "goals"
@@ -20,6 +20,6 @@ class GoalsOptions(PlanOptions):
     tasks: tuple[str, ...] = task_names("goals")
     """Tasks to plan for."""
     pick_encodings: tuple[str, ...] = ("joint",)
-    """How CEM encodes what is grasped."""
+    """CEM's encoding of the choice of particles."""
     budget: Literal["default", "paper", "goals"] = "goals"
-    """Search settings: those that end in minutes, the paper's own, or more for several folds."""
+    """Search settings: a search of minutes, the paper's settings, or more for several folds."""

@@ -1,7 +1,7 @@
-"""Goals whose right key points are known: folds and polylines, sharp or rounded, with noise.
+"""Goals with known key points: folds and polylines, sharp or rounded, with noise.
 
-The key points of a fold are the corners of the outline, and where fold lines meet the outline
-or each other; those of a polyline are its ends and corners.
+The key points of a fold are the corners of the outline, and the intersections of fold lines with
+the outline and each other; those of a polyline are its ends and corners.
 """
 
 from collections.abc import Iterator
@@ -18,12 +18,12 @@ from jaxsimp.simplification import KeyPoints
 
 
 class Line(NamedTuple):
-    """A fold line: what lies to its left is turned over onto what lies to its right.
+    """A fold line: the part on its left is turned over onto the part on its right.
 
     Attributes:
-        point: x and y of a point on it, in half extents of the cloth.
+        point: x and y of a point on the line, in half extents of the cloth.
         direction: x and y of its direction, in half extents.
-        height: of the crease, in gaps of layers: half way between the layers that it joins.
+        height: height of the crease, in gaps of layers: halfway between the layers that it joins.
     """
 
     point: tuple[float, float]
@@ -35,7 +35,7 @@ class IdealFold(NamedTuple):
     """A fold of a rectangular cloth.
 
     Attributes:
-        lines: in the order of folding, in the place where the cloth then is.
+        lines: fold lines in the order of folding, each in the position of the cloth at that time.
         points: key points besides the four corners, in half extents of the cloth at rest.
     """
 
@@ -77,13 +77,13 @@ FOLDS = {
 
 @dataclass(frozen=True, eq=False)
 class IdealGoal:
-    """A goal and the key points that are right for it.
+    """A goal and its true key points.
 
     Attributes:
-        name: the fold.
+        name: name of the fold or polyline.
         body: the cloth.
         goal: goal positions, shape (N, 3), metres.
-        true_points: rest coordinates of the key points, shape (K, 3), metres.
+        true_points: rest coordinates of the true key points, shape (K, 3), metres.
     """
 
     name: str
@@ -98,7 +98,7 @@ def ideal_goal(body: Body, name: str, *, gap: float = 0.004, rounding: float = 0
     Args:
         body: a rectangular cloth.
         name: one of `FOLDS`.
-        gap: distance of layers that lie on each other, metres.
+        gap: distance of adjacent layers, metres.
         rounding: lateral radius of the creases, metres; 0 for sharp ones.
     """
     half = np.ptp(body.rest, axis=0) / 2
@@ -130,20 +130,20 @@ def rounded_fold(
 ) -> Positions:
     """Fold about a line, with a crease that is half an ellipse, shape (N, 3).
 
-    The crease takes a strip of pi times its radius about the line; outside of it particles lie
+    The crease takes a strip about the line, pi times its radius wide; particles outside of it lie
     as after a sharp fold. Heights are mirrored too.
 
     Args:
-        positions: what is folded, shape (N, 3), metres.
+        positions: positions to fold, shape (N, 3), metres.
         point: x and y of a point on the line, metres.
         direction: x and y of the line's direction.
-        height: of the line, metres: half way between the layers that it joins.
+        height: height of the line, metres: halfway between the layers that it joins.
         rounding: lateral radius of the crease, metres; 0 for a sharp one.
     """
     left = np.array([-direction[1], direction[0]]) / np.linalg.norm(direction)
     distance = (positions[:, :2] - point) @ left
     distance[np.abs(distance) < 1e-9] = 0.0
-    # Turned by 0 to pi over the strip of the crease; on a sharp one at once.
+    # The turn goes from 0 to pi over the strip of the crease; a sharp crease has no strip.
     strip = np.pi * rounding / 2
     if rounding > 0:
         angle = np.clip(distance / rounding + np.pi / 2, 0.0, np.pi)
@@ -172,13 +172,12 @@ LINES: dict[str, tuple[tuple[float, float], ...]] = {
 
 
 def ideal_line(body: Body, name: str, *, rounding: float = 0.0) -> IdealGoal:
-    """A rope along a polyline of its length, with its key points.
+    """A rope along a polyline as long as the rope, with its key points.
 
     Args:
         body: a rope.
         name: one of `LINES`.
-        rounding: length at either side of a corner over which the rope turns, metres; 0 for
-            sharp corners.
+        rounding: length of the turn on either side of a corner, metres; 0 for sharp corners.
     """
     corners = np.array(LINES[name], dtype=float)
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
@@ -186,7 +185,7 @@ def ideal_line(body: Body, name: str, *, rounding: float = 0.0) -> IdealGoal:
     corners *= length / lengths.sum()
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) * length / lengths.sum()
     along = body.rest[:, 0] - body.rest[0, 0]
-    # A moving average of the sharp line rounds its corners, and leaves the rest as it is.
+    # A moving average of the sharp line rounds its corners, and does not change the rest.
     offsets = np.linspace(-rounding, rounding, 11)
     shifted = np.clip(along[:, None] + offsets, 0.0, length)
     goal = np.full(body.rest.shape, body.radius)
@@ -225,7 +224,7 @@ def _wrinkles(ideal: IdealGoal, rng: np.random.Generator) -> np.ndarray:
 
 
 def _outliers(ideal: IdealGoal, rng: np.random.Generator) -> np.ndarray:
-    """White noise of a quarter, and one particle in fifty that is four times off."""
+    """White noise of a quarter of the level; 1 particle in 50 is off by 4 times the level."""
     noise = rng.normal(size=ideal.goal.shape) / 4
     far = rng.random(len(noise)) < 0.02
     off = rng.normal(size=noise.shape)
@@ -249,8 +248,8 @@ def add_noise(ideal: IdealGoal, kind: str, level: float, seed: int) -> IdealGoal
     Args:
         ideal: a goal.
         kind: one of `NOISES`.
-        level: standard deviation along an axis that is noisy, metres; of outliers see there.
-        seed: of the noise.
+        level: standard deviation along each noisy axis, metres; for outliers see `_outliers`.
+        seed: seed of the noise.
     """
     noise = NOISES[kind](ideal, np.random.default_rng(seed))
     return IdealGoal(ideal.name, ideal.body, ideal.goal + level * noise, ideal.true_points)
@@ -260,9 +259,9 @@ def is_right(key_points: KeyPoints, ideal: IdealGoal, spacings: float = 1.5) -> 
     """Whether there are as many key points as true ones, each near its own at rest.
 
     Args:
-        key_points: what was found.
+        key_points: key points found.
         ideal: the goal with its true points.
-        spacings: how far a key point may be from the true one, in spacings of the body.
+        spacings: largest distance of a key point from the true one, in spacings of the body.
     """
     if len(key_points) != len(ideal.true_points):
         return False

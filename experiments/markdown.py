@@ -1,4 +1,4 @@
-"""Pieces that reports share: tables, intervals, figures, provenance."""
+"""Parts of reports: tables, intervals, figures, provenance."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -41,7 +41,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
 
 
 def provenance(environment: dict[str, Any], files: str) -> list[str]:
-    """What the results of a study depend on, and in which files they are."""
+    """Lines on the software and machine behind the results of a study, and on its files."""
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
     return [
         "## Provenance",

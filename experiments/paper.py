@@ -11,7 +11,7 @@ from jaxsimp.tasks import task_names
 class PaperOptions(PlanOptions):
     """The paper's four tasks: key points of their goals, plans over them and over all particles.
 
-    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    Stop it with Ctrl-C or kill it at any time: the same command resumes it.
     """
 
     NAME: ClassVar[str] = "paper"
@@ -19,4 +19,4 @@ class PaperOptions(PlanOptions):
     tasks: tuple[str, ...] = task_names("paper")
     """Tasks to plan for."""
     method: str = "paper"
-    """How goals are simplified: robust, paper or meshlab."""
+    """Method of simplification: robust, paper or meshlab."""

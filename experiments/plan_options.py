@@ -1,4 +1,4 @@
-"""Options that studies of plans share."""
+"""Options common to studies of plans."""
 
 import dataclasses
 import time
@@ -25,52 +25,52 @@ class PlanOptions:
     tasks: tuple[str, ...] = task_names()
     """Tasks to plan for."""
     method: str = "robust"
-    """How goals are simplified: robust, paper or meshlab."""
+    """Method of simplification: robust, paper or meshlab."""
     action_spaces: tuple[str, ...] = ACTION_SPACES
-    """Particles that may be grasped."""
+    """Action spaces: the particles that a picker may grasp."""
     pick_encodings: tuple[str, ...] = ("categorical", "gaussian_index")
-    """How CEM encodes what is grasped."""
+    """CEM's encoding of the choice of particles."""
     seeds: int = 10
     """Seeds 0 to SEEDS - 1 of each combination."""
     resolution: int | None = None
     """Particles along the rope or a side of the cloth (default: 41 and 25)."""
     budget: Literal["default", "paper", "goals"] = "default"
-    """Search settings: those that end in minutes, the paper's own, or more for several folds."""
+    """Search settings: a search of minutes, the paper's settings, or more for several folds."""
     num_iterations: int | None = None
-    """CEM rounds, instead of the budget's."""
+    """Number of CEM rounds, instead of the budget's."""
     population: int | None = None
-    """Plans drawn a round, instead of the budget's."""
+    """Number of plans per round, instead of the budget's."""
     initial_populations: int | None = None
-    """Populations drawn in the first CEM round, instead of the budget's."""
+    """Number of populations in the first CEM round, instead of the budget's."""
     elite_fraction: float | None = None
-    """Share of the population that are elites, instead of the budget's."""
+    """Fraction of the population that are elites, instead of the budget's."""
     smoothing: float | None = None
-    """Share of the old distribution kept in an update, instead of the budget's."""
+    """Fraction of the old distribution kept in an update, instead of the budget's."""
     initial_spread: float | None = None
-    """First deviation of displacements in units of their limits, instead of the budget's."""
+    """First deviation of displacements, in units of the limits, instead of the budget's."""
     keep_best: bool | None = None
     """Whether the best plan so far stays among the elites, instead of the budget's."""
     returns: Literal["best", "mean"] | None = None
     """The best plan drawn, or the mean of the last distribution, instead of the budget's."""
     num_actions: int | None = None
-    """Actions in a plan (the horizon), instead of the budget's."""
+    """Number of actions in a plan (the horizon), instead of the budget's."""
     planning: Literal["nominal", "robust", "self_contact", "mixed"] = "nominal"
-    """Physics of the search: the body's physics alone, an ensemble of them, the body touching
-    itself, or the last for cloths and the first for ropes."""
+    """Physics of the search: the body's own physics, an ensemble, self-contact, or self-contact for
+    cloths and the body's own physics for ropes."""
     self_contact: bool = True
-    """Carry out and score plans that were found with the body touching itself."""
+    """Carry out and score the plans found with self-contact."""
     out: Path | None = None
     """Output folder (default: results/paper, or results/paper-smoke)."""
     smoke: bool = False
-    """Small bodies, few rollouts, two seeds: everything once, in under two minutes."""
+    """Run everything once in under two minutes: small bodies, few rollouts, two seeds."""
     list: bool = False
-    """List the tasks, action spaces and encodings, and end."""
+    """List the tasks, action spaces and encodings, and exit."""
 
     def configuration(self) -> PlanStudy:
-        """The study that these options ask for.
+        """The study of these options.
 
         Raises:
-            ValueError: if an option has a value that it cannot have.
+            ValueError: if the value of an option is invalid.
         """
         names = [
             field.name
@@ -96,13 +96,13 @@ class PlanOptions:
         )
 
     def run(self, console: Console) -> None:
-        """Run the study, or list what it can be asked for."""
+        """Run the study, or list its possible tasks, action spaces and encodings."""
         if self.list:
             _list(console)
             return
         study, folder = self.configuration(), self.folder()
         records.open_folder(folder, study.identity())
-        # Here, so that --help and wrong options do not wait for matplotlib.
+        # Imported here, so that --help and wrong options do not wait for matplotlib.
         from experiments.plan_report import write_report
 
         start = time.perf_counter()
@@ -110,7 +110,7 @@ class PlanOptions:
         told_done(console, folder, start)
 
     def folder(self) -> Path:
-        """Where results go."""
+        """Folder of the results."""
         name = self.NAME
         if self.planning != type(self).planning:
             name += f"-{self.planning}"

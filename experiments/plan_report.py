@@ -1,4 +1,4 @@
-"""What a study of plans leaves behind: summary.json, figures, and a report that shows them."""
+"""Output of a study of plans: summary.json, figures, and a report."""
 
 import json
 from collections import defaultdict
@@ -14,7 +14,7 @@ from jaxsimp import records, viz
 Rows = list[dict[str, Any]]
 SUMMARY_FILE = "summary.json"
 TRANSFER_FILE = "transfer.json"
-"""How the plans do in MuJoCo: there once the study of transfer has replayed them."""
+"""Results of the plans in MuJoCo, once the study of transfer has replayed them."""
 LABELS = {
     "key_points": "key points",
     "all_particles": "all particles",
@@ -55,7 +55,7 @@ def _of(rows: Rows, **fields: Any) -> Rows:
 
 
 def _methods(rows: Rows) -> dict[str, Rows]:
-    """Rows by method, in the order in which methods first appear."""
+    """Rows by method, in the order of the methods' first rows."""
     methods: dict[str, Rows] = defaultdict(list)
     for row in rows:
         name = f"{LABELS[row['action_space']]}, {LABELS[row['pick_encoding']]}"
@@ -64,7 +64,7 @@ def _methods(rows: Rows) -> dict[str, Rows]:
 
 
 def _costs(rows: Rows) -> dict[str, np.ndarray]:
-    """Cost of the best plan so far, a row a run; nothing finite yet counts as not a number."""
+    """Cost of the best plan so far, one row per run; NaN before the first finite cost."""
     return {
         method: np.array([row["cost_per_iteration"] for row in runs], dtype=float)
         for method, runs in _methods(rows).items()
@@ -72,7 +72,7 @@ def _costs(rows: Rows) -> dict[str, np.ndarray]:
 
 
 def _typical_seed(rows: Rows) -> int:
-    """The seed whose score is the median one of the first method: neither best nor worst."""
+    """The seed with the median score of the first method."""
     runs = next(iter(_methods(rows).values()))
     return sorted(runs, key=lambda row: _score(row))[len(runs) // 2]["seed"]
 
@@ -148,7 +148,7 @@ def _touching(study: PlanStudy) -> str:
 
 
 def _run_table(rows: Rows, transfer: Rows) -> list[str]:
-    """Scores and rates by task and method; those in MuJoCo where they are known."""
+    """Scores and rates by task and method, in MuJoCo too if known."""
     lines = []
     for task in dict.fromkeys(row["task"] for row in rows):
         for method, runs in _methods(_of(rows, task=task)).items():
@@ -185,7 +185,7 @@ def _run_table(rows: Rows, transfer: Rows) -> list[str]:
 
 
 def _transferred(runs: Rows, transfer: Rows) -> list[str]:
-    """The cell of scores in MuJoCo; none where no plan has been replayed there."""
+    """The cell of scores in MuJoCo; empty if no plan has been replayed there."""
     if not transfer:
         return []
     if not runs:

@@ -1,8 +1,8 @@
 """Studies of plans: key points of goals, then plans over them and over all particles.
 
-The paper's study is that of its four tasks, with its own simplification. Sheng Yin et al. are
-followed where the paper or its author's code says how: `BUDGETS` holds the author's settings
-beside those that end in minutes.
+The paper's study has its four tasks and its own simplification. It follows Sheng Yin et al.
+wherever the paper or its author's code gives details: `BUDGETS` holds the author's settings and
+settings for a search of minutes.
 """
 
 import dataclasses
@@ -26,18 +26,18 @@ from jaxsimp.tasks import Task, make_task, task_names
 
 ACTION_SPACES = ("key_points", "all_particles")
 PLANNING = ("nominal", "robust", "self_contact", "mixed")
-"""Physics of a search: the body's own alone, an ensemble of them, with self-contact, or with
-self-contact where the body is a cloth, whose folds have layers."""
+"""Physics of a search: the body's own, an ensemble, self-contact, or self-contact only for cloths,
+whose folds have layers."""
 ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
 IDENTITY = ("task", "action_space", "pick_encoding", "seed")
-"""Fields that tell a run from all others."""
+"""Fields that identify a run."""
 PLANS_FOLDER = "plans"
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How much a plan may cost: the search, and overrides of the task's plan shape."""
+    """Budget of a plan: the search settings, and overrides of the task's plan shape."""
 
     rope: CEM
     cloth: CEM
@@ -71,7 +71,7 @@ BUDGETS = {
     ),
     "goals": Budget(
         rope=CEM(num_iterations=24),
-        # Several folds are found one after another: the search must not settle on the first.
+        # The search finds several folds one after another: it must not converge on the first.
         cloth=CEM(num_iterations=40, smoothing=0.2),
         garment=CEM(num_iterations=24),
     ),
@@ -84,23 +84,23 @@ BUDGETS = {
 
 @dataclass(frozen=True)
 class PlanStudy:
-    """One configuration of the study: what makes two results comparable.
+    """Configuration of the study; results of the same configuration are comparable.
 
     Attributes:
-        name: of the study.
+        name: name of the study.
         tasks: names of the tasks.
-        method: of simplification.
-        success_score: least settled score of a plan that succeeds.
-        action_spaces: which particles may be grasped.
+        method: method of simplification.
+        success_score: smallest settled score of a successful plan.
+        action_spaces: names of the sets of particles that a picker may grasp.
         pick_encodings: names of the encodings.
-        seeds: every combination is run with the seeds 0 to `seeds` - 1.
-        quick: small bodies instead of full ones.
-        resolution: particles along a side, instead of the scale's.
+        seeds: number of seeds: every combination runs with the seeds 0 to `seeds` - 1.
+        quick: whether bodies are small instead of full.
+        resolution: number of particles along a side, instead of the scale's.
         budget: name of the budget.
         settings: CEM settings that replace the budget's.
-        num_actions: actions in a plan, instead of the budget's or the task's.
-        planning: one of `PLANNING`.
-        self_contact: whether plans that were found are carried out and scored with self-contact.
+        num_actions: number of actions in a plan, instead of the budget's or the task's.
+        planning: physics of the search, one of `PLANNING`.
+        self_contact: whether to carry out and score the plans found with self-contact.
     """
 
     name: str
@@ -128,7 +128,7 @@ class PlanStudy:
             raise ValueError(f"seeds is {self.seeds}; at least 1 is needed")
         if self.num_actions is not None and self.num_actions < 1:
             raise ValueError(f"num_actions is {self.num_actions}; at least 1 is needed")
-        for name in self.tasks:  # Refuses a resolution or a setting before anything is run.
+        for name in self.tasks:  # Raises for a wrong resolution or setting before any run.
             self.search_config(self.task(name))
 
     def task(self, name: str) -> Task:
@@ -143,7 +143,7 @@ class PlanStudy:
         """The search settings of a task."""
         config = BUDGETS[self.budget].config(task)
         if self.planning_of(task) == "self_contact":
-            # A round takes some four times as long.
+            # A round takes about four times as long.
             rounds = ceil(config.num_iterations / 2)
             config = dataclasses.replace(config, num_iterations=rounds)
         return dataclasses.replace(config, **self.settings)
@@ -155,14 +155,14 @@ class PlanStudy:
         return "self_contact" if len(task.body.faces) else "nominal"
 
     def engine(self, task: Task) -> SearchEngine:
-        """The physics that the search costs plans in."""
+        """The engine that gives the search the costs of plans."""
         planning = self.planning_of(task)
         if planning == "robust":
             return make_ensemble(task, ENSEMBLE_SIZE)
         return MassSprings(self_contact=planning == "self_contact")
 
     def identity(self) -> dict[str, Any]:
-        """What two folders of results must share: the options, and what their names mean."""
+        """Identity of a folder of results: the options, and the meaning of their names."""
         search = {name: settings(self.search_config(self.task(name))) for name in self.tasks}
         spread = {"size": ENSEMBLE_SIZE, "spread": dataclasses.asdict(Spread())}
         ensemble = spread if self.planning == "robust" else None
@@ -184,7 +184,7 @@ def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) ->
 
 
 def run_study(study: PlanStudy, folder: Path, console: Console) -> dict[str, Any]:
-    """Run what is not in the folder yet, and return the summary of everything in it."""
+    """Run the combinations missing from the folder, and return the summary of all in it."""
     models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
@@ -211,7 +211,7 @@ def _run_all(
     folder: Path,
     console: Console,
 ) -> None:
-    """Compile, estimate, and run task by task, a row on disk after each run."""
+    """Compile, estimate, and run task by task, writing a row after each run."""
     (folder / PLANS_FOLDER).mkdir(exist_ok=True)
     environment = records.environment()
     planners, seconds, compiled = {}, {}, {}
@@ -225,7 +225,7 @@ def _run_all(
             f"{name}: compiled in {compiled[name]:.1f} s; "
             f"{len(left[name])} runs of about {seconds[name] / len(left[name]):.1f} s"
         )
-    console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for what is left")
+    console.print(f"estimate: {sum(seconds.values()) / 60:.1f} minutes for the remaining runs")
     with progress_bar(console) as progress:
         for name, planner in planners.items():
             algorithm, compile_seconds = study.search_config(planner.task), compiled[name]
@@ -294,7 +294,7 @@ def _run(
 
 
 def settings(algorithm: CEM) -> dict[str, Any]:
-    """Settings of a search but for its encoding, which is told beside them."""
+    """Settings of a search without its encoding, which has its own field."""
     found = dataclasses.asdict(algorithm)
     del found["encoding"]
     return found
@@ -315,7 +315,7 @@ def _row_config(planner: Planner, algorithm: CEM) -> dict[str, Any]:
 
 
 def finite(value: float) -> float | None:
-    """JSON has no infinity: a cost that no rollout gave is null."""
+    """The value, or None (null in JSON, which has no infinity) if it is not finite."""
     return value if np.isfinite(value) else None
 
 

@@ -16,9 +16,9 @@ def progress_bar(console: Console, *, remaining: bool = True) -> Progress:
     """A bar with its description, the number of steps done, and a time.
 
     Args:
-        console: where it is shown.
-        remaining: whether the time is what is left, or what has passed: an estimate is of use
-            where the steps take about as long.
+        console: console that shows the bar.
+        remaining: whether to show the remaining time instead of the elapsed time; the estimate
+            assumes steps of similar duration.
     """
     time: ProgressColumn = TimeRemainingColumn() if remaining else TimeElapsedColumn()
     return Progress(

@@ -17,12 +17,12 @@ STUDIES: dict[str, type[StudyOptions]] = {
     options.NAME: options
     for options in (PaperOptions, GoalsOptions, SimplificationOptions, TransferOptions)
 }
-"""Options of the studies by name; the first one is run where none is named."""
+"""Options of the studies by name; the first study is the default."""
 
 
 def main() -> int:
     """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
-    return exit_status(_run, "interrupted; the same command goes on where it was")
+    return exit_status(_run, "interrupted; the same command resumes it")
 
 
 def _run() -> int:
@@ -38,7 +38,7 @@ def _run() -> int:
 
 
 def _study(arguments: list[str]) -> tuple[str, list[str]]:
-    """The name of the study, the first argument if there is one, and the other arguments."""
+    """The name of the study, from the first argument if given, and the other arguments."""
     if not arguments or arguments[0].startswith("-"):
         return next(iter(STUDIES)), arguments
     name, *others = arguments

@@ -1,7 +1,7 @@
-"""Hand-made plans of the paper's tasks: what a fold or a pull that is surely right scores.
+"""Hand-made plans of the paper's tasks, as a reference for the score of a known good fold or pull.
 
-A plan that was searched for may fail in another engine because of what the search exploited. A
-hand-made one fails only where the engines differ.
+A plan found by a search may fail in another engine because the search exploited its own. A
+hand-made plan fails only if the engines differ.
 """
 
 from collections.abc import Callable
@@ -14,16 +14,16 @@ from jaxsimp.dynamics import NONE, Actions
 from jaxsimp.tasks import Episode, Task
 
 APEX = 0.12
-"""Height over which a fold is carried, metres."""
+"""Height of a carried part in a fold, metres."""
 Moves = dict[int, Float[np.ndarray, "3"]]
-"""Displacements by the particle that is picked, metres."""
+"""Displacements by picked particle, metres."""
 
 
 def scripted_plan(task: Task, episode: Episode) -> Actions:
     """The hand-made plan of one of the paper's tasks.
 
     Raises:
-        ValueError: if there is none for the task.
+        ValueError: if the task has no hand-made plan.
     """
     if task.name not in SCRIPTS:
         raise ValueError(f"no plan is scripted for {task.name!r}; choose one of {list(SCRIPTS)}")
@@ -31,7 +31,7 @@ def scripted_plan(task: Task, episode: Episode) -> Actions:
 
 
 def _straighten(task: Task, episode: Episode) -> list[Moves]:
-    """Pull the two ends apart along the table, until they are as far as in the goal."""
+    """Pull the two ends apart along the table, to their distance in the goal."""
     last = task.body.num_particles - 1
     apart, wanted = (
         np.asarray(positions, float)[last] - np.asarray(positions, float)[0]
@@ -52,7 +52,7 @@ def _fold_rope(task: Task, episode: Episode) -> list[Moves]:
 
 
 def _fold_sideways(task: Task, episode: Episode) -> list[Moves]:
-    """Carry the two corners of the moving edge onto those of the edge that lies still."""
+    """Carry the two corners of the moving edge onto those of the still edge."""
     return _carry_over(task, episode, (0, task.body.shape[1] - 1))
 
 
@@ -62,7 +62,7 @@ def _fold_diagonally(task: Task, episode: Episode) -> list[Moves]:
 
 
 def _carry_over(task: Task, episode: Episode, corners: tuple[int, ...]) -> list[Moves]:
-    """Up and half the way, then the other half and down to just above the layer below."""
+    """Move up and half the way, then the other half and down to just above the layer below."""
     way, up = _ways(episode), np.array([0.0, 0.0, APEX])
     gap = np.array([0.0, 0.0, 3 * task.body.radius])
     return [
@@ -72,12 +72,12 @@ def _carry_over(task: Task, episode: Episode, corners: tuple[int, ...]) -> list[
 
 
 def _ways(episode: Episode) -> Float[np.ndarray, "N 3"]:
-    """From the start to the goal, metres."""
+    """Displacements from the start to the goal, metres."""
     return np.asarray(episode.goal, float) - np.asarray(episode.start, float)
 
 
 def _actions(task: Task, moves: list[Moves]) -> Actions:
-    """A plan of the task's length from what each of its first actions does."""
+    """A plan of the task's length from the moves of its first actions."""
     shape = (task.num_actions, task.num_pickers)
     pick, displacement = np.full(shape, NONE), np.zeros((*shape, 3))
     for t, each in enumerate(moves[: task.num_actions]):
@@ -92,4 +92,4 @@ SCRIPTS: dict[str, Callable[[Task, Episode], list[Moves]]] = {
     "cloth_side_folding": _fold_sideways,
     "cloth_diagonal_folding": _fold_diagonally,
 }
-"""What each action of a task's plan does."""
+"""Functions that make the moves of each action, by task."""

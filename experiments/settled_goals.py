@@ -1,4 +1,4 @@
-"""Goals that a simulation settled in: a cloth folded by two pickers, with small errors."""
+"""Goals from settled states of a simulation: a cloth folded by two pickers, with small errors."""
 
 from collections.abc import Callable
 from functools import cache
@@ -23,24 +23,23 @@ from jaxsimp.dynamics import (
 
 SETTLED_FOLDS = ("side, x", "side, y", "diagonal", "other diagonal", "letter")
 CARELESSNESS = 0.003
-"""Deviation of the pickers from where they should go, along each axis, metres."""
+"""Standard deviation of the pickers from their targets, along each axis, metres."""
 LIFT = 0.4
-"""Height of a carried corner half way, over how far it is carried."""
+"""Height of a carried corner halfway, as a fraction of its horizontal displacement."""
 ACTION_SECONDS = 0.3
 IDLE_ACTIONS = 4
-"""With nothing held, at the end."""
+"""Number of actions with nothing held, at the end."""
 
 
 def settled_goal(body: Body, name: str, seed: int) -> IdealGoal:
     """The state of a cloth after a scripted fold, settled; its key points are those of the fold.
 
-    The corners that a fold moves are carried over in an arc of two actions, not quite to where
-    they should go.
+    Pickers carry the corners that a fold moves in an arc of two actions, with a random error.
 
     Args:
         body: a rectangular cloth.
         name: one of `SETTLED_FOLDS`.
-        seed: of the pickers' errors.
+        seed: seed of the pickers' errors.
     """
     rng = np.random.default_rng(seed)
     picks, moves = [], []
@@ -73,7 +72,7 @@ def _corners(body: Body) -> np.ndarray:
 
 @cache
 def _simulation_fn(body: Body) -> Callable[[Actions], Float[Array, "N 3"]]:
-    """Positions of a body that starts flat, at the end of actions."""
+    """Function from actions to the final positions of a body that starts flat."""
     time_step = min(2e-3, 0.9 * largest_time_step(body))
     simulation = make_simulation(body, time_step)
     pickers = make_pickers((1.0, 1.0, 1.0), steps=round(ACTION_SECONDS / time_step))

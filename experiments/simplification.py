@@ -1,8 +1,8 @@
-"""The study of simplification: how often each method finds the right key points of noisy goals.
+"""The study of simplification: rate at which each method finds the right key points of noisy goals.
 
-A goal is right when its key points are as many as the true ones and each is within one and a half
-spacings of its own. Goals are ideal ones with noise (see ideal_goals.py), and settled states of
-our dynamics after a scripted fold.
+The key points of a goal are right if they are as many as the true ones and each is within 1.5
+spacings of its true one. Goals are ideal ones with noise (see ideal_goals.py), and settled states
+of our dynamics after a scripted fold.
 """
 
 import importlib.util
@@ -34,26 +34,26 @@ from jaxsimp.simplification import METHODS, simplify_batch
 
 ROWS_FILE = "goals.jsonl"
 IDENTITY = ("kind", "name", "size", "noise", "level", "gap", "rounding", "seed", "method")
-"""Fields that tell a row from all others: those of a `Case`, and the method."""
+"""Fields that identify a row: those of a `Case`, and the method."""
 ROPE_LENGTH = 1.0
 ROPE_LEVELS, CLOTH_LEVELS = (0.001, 0.002, 0.004), (0.0005, 0.001, 0.002)
 """Levels of noise, metres: on a rope of 1 m and a cloth of 0.3 m."""
 LARGEST_GAP = 0.01
-"""Gaps of layers are drawn from 0 to this, metres."""
+"""Largest random gap of layers, metres."""
 ROUNDINGS = (0.0, 0.004)
 """Lateral radii of creases, metres."""
 
 
 @dataclass(frozen=True)
 class SimplificationStudy:
-    """One configuration of the study.
+    """Configuration of the study.
 
     Attributes:
-        methods: of simplification.
-        seeds: draws of noise, gap and rounding for each goal and resolution.
-        rope_sizes: particles along the ropes.
-        cloth_sizes: particles along a side of the cloths.
-        settled_size: particles along a side of the cloths that are settled.
+        methods: methods of simplification.
+        seeds: number of draws of noise, gap and rounding for each goal and resolution.
+        rope_sizes: numbers of particles along the ropes.
+        cloth_sizes: numbers of particles along a side of the cloths.
+        settled_size: number of particles along a side of the settled cloths.
     """
 
     methods: tuple[str, ...]
@@ -72,7 +72,7 @@ class SimplificationStudy:
             raise ValueError(f"seeds is {self.seeds}; at least 1 is needed")
 
     def identity(self) -> dict[str, Any]:
-        """What two folders of results must share."""
+        """Identity of a folder of results."""
         return asdict(self)
 
     def cases(self) -> Iterator["Case"]:
@@ -94,13 +94,13 @@ class Case:
 
     Attributes:
         kind: "rope", "cloth", or "settled" for the settled state of a cloth.
-        name: of the shape or the fold.
-        size: particles along the rope or along a side.
-        noise: its kind.
-        level: of the noise, metres.
-        gap: of layers, metres.
+        name: name of the shape or the fold.
+        size: number of particles along the rope or along a side.
+        noise: kind of noise.
+        level: level of the noise, metres.
+        gap: gap of layers, metres.
         rounding: radius of corners or creases, metres.
-        seed: of the noise.
+        seed: seed of the noise.
     """
 
     kind: str
@@ -131,9 +131,9 @@ def make_body(kind: str, size: int) -> Body:
 
 
 def _drawn(kind: str, name: str, size: int, index: int, seed: int) -> Case:
-    """A case whose noise goes through all kinds and levels, and whose gap is drawn at random."""
+    """A case with the next kind and level of noise in turn, and a random gap."""
     levels = ROPE_LEVELS if kind == "rope" else CLOTH_LEVELS
-    # Neighbouring goals and seeds get other combinations, so that few seeds see all of them.
+    # Neighbouring goals and seeds get different combinations, so that few seeds cover all of them.
     turn = seed + index
     rng = np.random.default_rng([size, index, seed])
     return Case(
@@ -149,13 +149,13 @@ def _drawn(kind: str, name: str, size: int, index: int, seed: int) -> Case:
 
 
 def available_methods() -> tuple[str, ...]:
-    """All methods of simplification, but for those whose extra is not installed."""
+    """All methods of simplification, except those whose extra is not installed."""
     missing = () if importlib.util.find_spec("pymeshlab") else ("meshlab",)
     return tuple(name for name in METHODS if name not in missing)
 
 
 def run_study(study: SimplificationStudy, folder: Path, console: Console) -> dict[str, Any]:
-    """Simplify what is not in the folder yet, and return the summary of everything in it."""
+    """Simplify the goals missing from the folder, and return the summary of all in it."""
     rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
     todo = {
         (*asdict(case).values(), method): (case, method)
@@ -189,27 +189,27 @@ def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class SimplificationOptions:
-    """How often each method finds the right key points of noisy goals.
+    """Rate at which each method finds the right key points of noisy goals.
 
-    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    Stop it with Ctrl-C or kill it at any time: the same command resumes it.
     """
 
     NAME: ClassVar[str] = "simplification"
 
     methods: tuple[str, ...] = available_methods()
-    """Methods to compare (default: all, meshlab where its extra is installed)."""
+    """Methods to compare (default: all, meshlab if its extra is installed)."""
     seeds: int = 12
-    """Draws of noise for each goal and resolution."""
+    """Number of draws of noise for each goal and resolution."""
     out: Path | None = None
     """Output folder (default: results/simplification, or results/simplification-smoke)."""
     smoke: bool = False
     """One resolution, one seed."""
 
     def configuration(self) -> SimplificationStudy:
-        """The study that these options ask for.
+        """The study of these options.
 
         Raises:
-            ValueError: if an option has a value that it cannot have.
+            ValueError: if the value of an option is invalid.
         """
         return SimplificationStudy(
             methods=self.methods,

@@ -1,4 +1,4 @@
-"""What the study of simplification leaves behind: summary.json, figures, and a report."""
+"""Output of the study of simplification: summary.json, figures, and a report."""
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -43,7 +43,7 @@ def write_report(study: SimplificationStudy, summary: dict[str, Any], folder: Pa
 
 
 def _shown(study: SimplificationStudy, method: str) -> dict[str, tuple[Any, KeyPoints]]:
-    """Goals with noise of one seed, and what a method makes of them."""
+    """Noisy goals of one seed, and a method's models of them."""
     shown = {}
     for case in _typical_cases(study):
         ideal = case.make()
@@ -53,7 +53,7 @@ def _shown(study: SimplificationStudy, method: str) -> dict[str, tuple[Any, KeyP
 
 
 def _typical_cases(study: SimplificationStudy) -> list[Case]:
-    """One case for each goal that is shown: the last seed of the smallest size."""
+    """One case for each goal in the figures: the last seed of the smallest size."""
     cases = {case.name: case for case in reversed(list(study.cases())) if case.kind != "settled"}
     smallest = {study.rope_sizes[0], study.cloth_sizes[0]}
     for case in study.cases():
@@ -63,7 +63,7 @@ def _typical_cases(study: SimplificationStudy) -> list[Case]:
 
 
 def plot_rates(rows: Rows) -> "Figure":
-    """Rate of right key points by level of noise, a panel for each kind of goal."""
+    """Rate of right key points by level of noise, one panel per kind of goal."""
     import matplotlib.pyplot as plt
 
     kinds = [kind for kind in KINDS if _of(rows, kind=kind)]
@@ -98,7 +98,7 @@ def _draw_rates(axes: "Axes", rows: Rows, by: str) -> None:
 
 
 def plot_goals(rows: Rows) -> "Figure":
-    """Rate of right key points of each goal, a row a method."""
+    """Rate of right key points of each goal, one row per method."""
     import matplotlib.pyplot as plt
 
     names = list(dict.fromkeys(row["name"] for row in rows if row["kind"] != "settled"))
@@ -165,7 +165,7 @@ def _report(study: SimplificationStudy, summary: dict[str, Any]) -> str:
 
 
 def _rate_table(rows: Rows, heading: str, key: Callable[[dict[str, Any]], str]) -> list[str]:
-    """A line a group of goals, a column a method."""
+    """One line per group of goals, one column per method."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     groups: dict[str, Rows] = {}
     for row in rows:

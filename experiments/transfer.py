@@ -1,8 +1,8 @@
 """The study of transfer: plans found in our dynamics, carried out in MuJoCo.
 
-Each plan is replayed in both variants of `jaxsimp.engines.mujoco`. Plans that were scripted by hand
-are scored in all three, too: where those transfer and those that were found do not, the search
-has exploited our dynamics; where neither does, the engines differ.
+The study replays each plan in both variants of `jaxsimp.engines.mujoco`. It also scores hand-made
+plans in all three engines: if they transfer and the plans found do not, the search has exploited
+our dynamics; if neither do, the engines differ.
 """
 
 import dataclasses
@@ -29,19 +29,19 @@ from jaxsimp.tasks import Task, score, task_names
 ROWS_FILE = "replays.jsonl"
 REPLAYS_FOLDER = "replays"
 SCRIPTED = "scripted"
-"""The action space of plans that were made by hand."""
+"""Name of the action space of hand-made plans."""
 SCRIPTED_SEEDS = 2
-"""Seeds of the plans made by hand: a fold starts flat, and differs by how it is turned."""
+"""Number of seeds of the hand-made plans: a fold starts flat, and the seed sets its turn."""
 
 
 @dataclass(frozen=True)
 class TransferStudy:
-    """One configuration of the study.
+    """Configuration of the study.
 
     Attributes:
-        plans: the study whose plans are replayed.
-        source: folder of its results; None if they are found in the folder of this study.
-        success_score: least settled score of a plan that transfers.
+        plans: study of the plans to replay.
+        source: folder of its results; None if this study finds the plans, in its own folder.
+        success_score: smallest settled score of a plan that transfers.
     """
 
     plans: plans.PlanStudy
@@ -49,7 +49,7 @@ class TransferStudy:
     success_score: float
 
     def identity(self) -> dict[str, Any]:
-        """What two folders of results must share: the plans, and the models of MuJoCo."""
+        """Identity of a folder of results: the plans, and the models of MuJoCo."""
         variants = {name: dataclasses.asdict(variant) for name, variant in VARIANTS.items()}
         return {
             "source": self.source,
@@ -67,22 +67,22 @@ class TransferStudy:
 
 @dataclass(frozen=True)
 class Case:
-    """A plan to replay: its row of results so far, and where its arrays are."""
+    """A plan to replay: its row of results so far, and the path of its arrays."""
 
     row: dict[str, Any]
     path: Path
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What tells it from other plans."""
+        """Values that identify the plan."""
         return tuple(self.row[name] for name in plans.IDENTITY)
 
 
 def planned_study(folder: Path) -> plans.PlanStudy:
-    """The study of plans that a folder holds the results of.
+    """The study of plans with its results in a folder.
 
     Raises:
-        ValueError: if it does not.
+        ValueError: if the folder holds no results of a study of plans.
     """
     try:
         config = json.loads((folder / records.CONFIG_FILE).read_text())
@@ -98,7 +98,7 @@ def planned_study(folder: Path) -> plans.PlanStudy:
 
 
 def run_study(study: TransferStudy, folder: Path, console: Console) -> dict[str, Any]:
-    """Plan and replay what is not in the folder yet, and return the summary of everything."""
+    """Plan and replay the cases missing from the folder, and return the summary of all."""
     if study.source is None:
         found, source = plans.run_study(study.plans, folder, console)["runs"], folder
     else:
@@ -117,13 +117,13 @@ def run_study(study: TransferStudy, folder: Path, console: Console) -> dict[str,
 
 
 def _row_of_plan(row: dict[str, Any]) -> dict[str, Any]:
-    """What a replay's row takes over from that of its plan."""
+    """Fields that a replay's row takes from the row of its plan."""
     names = ("planning", "task", "seed", "action_space", "pick_encoding", "final_score", "plan")
     return {name: row[name] for name in names}
 
 
 def _scripted_cases(study: TransferStudy, folder: Path, console: Console) -> list[Case]:
-    """Plans made by hand, carried out in our dynamics where they are not on disk yet."""
+    """Hand-made plans, carried out in our dynamics unless already on disk."""
     (folder / plans.PLANS_FOLDER).mkdir(exist_ok=True)
     cases, executors = [], {}
     for name, seed in study.scripted():
@@ -154,7 +154,7 @@ def _scripted_cases(study: TransferStudy, folder: Path, console: Console) -> lis
 
 
 def _replay_all(study: TransferStudy, cases: list[Case], folder: Path, console: Console) -> None:
-    """Replay task by task what has no row yet."""
+    """Replay the cases without a row, task by task."""
     (folder / REPLAYS_FOLDER).mkdir(exist_ok=True)
     rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
     todo = set(rows.left(case.key for case in cases))
@@ -173,7 +173,7 @@ def _replay_task(task: Task, cases: list[Case], folder: Path) -> Iterator[dict[s
     """Replay plans in every variant, save each one's motions, and return its row."""
     episodes = [task.episode_fn(case.row["seed"]) for case in cases]
     plans = [records.load_plan(case.path).actions for case in cases]
-    # All variants at once: no core waits for the last plan of one.
+    # All variants at once, so that no core waits for the last plan of a variant.
     found = [replay(task, episodes, plans, name) for name in VARIANTS]
     for case, episode, actions, *results in zip(cases, episodes, plans, *found, strict=True):
         replays = dict(zip(VARIANTS, results, strict=True))
@@ -184,7 +184,7 @@ def _replay_task(task: Task, cases: list[Case], folder: Path) -> Iterator[dict[s
 
 
 def _fields(replays: dict[str, Execution]) -> dict[str, Any]:
-    """What replays add to a row."""
+    """Fields that replays add to a row."""
     warnings = [f"{name}: {each}" for name, one in replays.items() for each in one.warnings]
     scores = {f"mujoco_{name}_score": plans.finite(one.score) for name, one in replays.items()}
     status = {f"mujoco_{name}_status": one.status.name for name, one in replays.items()}
@@ -192,7 +192,7 @@ def _fields(replays: dict[str, Execution]) -> dict[str, Any]:
 
 
 def replay_path(folder: Path, row: dict[str, Any], variant: str) -> Path:
-    """Where the motion of a replay is."""
+    """Path of the motion of a replay."""
     return folder / REPLAYS_FOLDER / f"{Path(row['plan']).stem}-{variant}.npz"
 
 
@@ -200,7 +200,7 @@ def replay_path(folder: Path, row: dict[str, Any], variant: str) -> Path:
 class TransferOptions(PlanOptions):
     """Plans found in our dynamics, carried out in MuJoCo, with self-collision and without.
 
-    Stop it with Ctrl-C or kill it at any time: the same command goes on where it was.
+    Stop it with Ctrl-C or kill it at any time: the same command resumes it.
     """
 
     NAME: ClassVar[str] = "transfer"
@@ -209,32 +209,32 @@ class TransferOptions(PlanOptions):
     tasks: tuple[str, ...] = task_names("paper")
     """Tasks to plan for."""
     action_spaces: tuple[str, ...] = ("key_points",)
-    """Particles that may be grasped."""
+    """Action spaces: the particles that a picker may grasp."""
     pick_encodings: tuple[str, ...] = ("categorical",)
-    """How CEM encodes what is grasped."""
+    """CEM's encoding of the choice of particles."""
     planning: Literal["nominal", "robust", "self_contact", "mixed"] = "mixed"
-    """Physics of the search: the body's physics alone, an ensemble of them, the body touching
-    itself, or the last for cloths and the first for ropes."""
+    """Physics of the search: the body's own physics, an ensemble, self-contact, or self-contact for
+    cloths and the body's own physics for ropes."""
     plans: Path | None = None
-    """Folder of an earlier study, whose plans are replayed; options of planning are its own."""
+    """Folder of an earlier study of plans to replay, which sets the options of planning."""
 
     def transfer(self) -> TransferStudy:
-        """The study that these options ask for.
+        """The study of these options.
 
         Raises:
-            ValueError: if an option has a value that it cannot have.
+            ValueError: if the value of an option is invalid.
         """
         if self.plans and self.planning != TransferOptions.planning:
             raise ValueError(
-                f"--planning {self.planning} finds plans, and those of {self.plans} are found; "
-                f"leave one of them out"
+                f"--planning {self.planning} finds plans, but {self.plans} already holds plans; "
+                f"leave out --planning or --plans"
             )
         planned = planned_study(self.plans) if self.plans else self.configuration()
         source = str(self.plans) if self.plans else None
         return TransferStudy(planned, source, self.TRANSFER_SCORE)
 
     def run(self, console: Console) -> None:
-        """Run the study, or list what it can be asked for."""
+        """Run the study, or list its possible tasks, action spaces and encodings."""
         if self.list:
             super().run(console)
             return
@@ -251,7 +251,7 @@ class TransferOptions(PlanOptions):
 
 
 def _add_to_report(study: TransferStudy, summary: dict[str, Any], source: Path) -> None:
-    """Add columns of how plans transfer to the report of the study that they are from."""
+    """Add columns on transfer to the report of the study of the plans."""
     from experiments import plan_report
 
     records.write_json(source / plan_report.TRANSFER_FILE, summary["transfer"])

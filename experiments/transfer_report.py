@@ -1,4 +1,4 @@
-"""What the study of transfer leaves behind: summary.json, figures, and a report."""
+"""Output of the study of transfer: summary.json, figures, and a report."""
 
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,7 @@ def _of(rows: Rows, **fields: Any) -> Rows:
 
 
 def _points(rows: Rows) -> dict[str, np.ndarray]:
-    """Scores in ours and in MuJoCo's full variant, a row a plan, by action space."""
+    """Scores in ours and in MuJoCo's full variant, one row per plan, by action space."""
     return {
         LABELS[space]: np.array(
             [
@@ -57,7 +57,7 @@ def _points(rows: Rows) -> dict[str, np.ndarray]:
 
 
 def _shown(rows: Rows) -> dict[str, dict[str, Any]]:
-    """Plans worth a picture: that of the median score in full, the worst, one made by hand."""
+    """Plans for pictures: the median score in the full variant, the worst, and a hand-made one."""
     found = [row for row in rows if row["action_space"] != SCRIPTED]
     ranked = sorted(found, key=lambda row: _score(row, "mujoco_full_score"))
     shown = {"median": ranked[len(ranked) // 2], "worst": ranked[0]} if ranked else {}
@@ -66,7 +66,7 @@ def _shown(rows: Rows) -> dict[str, dict[str, Any]]:
 
 
 def _picture(study: TransferStudy, folder: Path, row: dict[str, Any], name: str) -> str:
-    """Draw a plan in all engines, a row each; the file's name."""
+    """Draw a plan in all engines, one row per engine, and return the file's name."""
     task = study.plans.task(row["task"])
     source = (
         folder if study.source is None or row["action_space"] == SCRIPTED else Path(study.source)
@@ -96,10 +96,10 @@ def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) 
         "Fast: hardly stretches, limp, layers pass through others. Full: elastic as our springs "
         "are, with self-collision and friction between layers.",
         "",
-        "## Plans that were found",
+        "## Plans found by the search",
         *_table(summary["transfer"], study.success_score),
         "",
-        "## Plans that were made by hand",
+        "## Plans made by hand",
         *_table(summary["scripted"], study.success_score),
         "",
         "## Scores in ours and in MuJoCo",

@@ -1,1 +1,1 @@
-"""How fast jaxsimp is on this machine, beside other ways to compute the same."""
+"""Speed of jaxsimp on this machine, beside other implementations of the same computation."""

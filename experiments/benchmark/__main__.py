@@ -34,22 +34,22 @@ SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """How fast jaxsimp is on this machine, beside other ways to compute the same.
+    """Speed of jaxsimp on this machine, beside other implementations of the same computation.
 
-    Figures compare within one run: they are taken in turns, on the load that there is.
+    Compare figures only within one run: the measurements take turns, under the current load.
     """
 
     quick: bool = False
-    """Smaller sizes and fewer repeats: every section, in about a minute."""
+    """Smaller sizes and fewer repeats: every section in about a minute."""
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A section to run instead of all; give it again for more."""
+    """Section to run instead of all; repeat the option for more."""
     json: Path | None = None
     """File for the rows."""
     figures: Path | None = None
     """Folder for plots."""
 
     def check(self) -> None:
-        """Refuse what cannot be done, before anything is run.
+        """Check the options before any run.
 
         Raises:
             ValueError: if there is no such section, or a path cannot be written to.
@@ -79,7 +79,7 @@ def _run(options: Options) -> int:
 
 
 def run(options: Options, scale: Scale, console: Console) -> list[Row]:
-    """Measure the sections asked for; print a table of each, and write what was asked for."""
+    """Measure the chosen sections, print a table of each, and write the chosen files."""
     names = [name for name in SECTIONS if name in options.only or not options.only]
     environment = records.environment()
     rows: list[Row] = []
@@ -94,7 +94,7 @@ def run(options: Options, scale: Scale, console: Console) -> list[Row]:
             if options.json:
                 records.write_json(options.json, {"environment": environment, "rows": rows})
     if options.figures:
-        # Here, so that --help and wrong options do not wait for matplotlib.
+        # Imported here, so that --help and wrong options do not wait for matplotlib.
         from experiments.benchmark.figures import save_figures
 
         save_figures(rows, options.figures)
@@ -113,7 +113,7 @@ HIDDEN = ("section", "chunk_size", "workers", "particle_steps", "checked_against
 
 
 def table(title: str, rows: list[Row]) -> Table:
-    """Rows for people: the columns in which some row has something."""
+    """Table of the rows, with the columns in which some row has a value."""
     shown = dict.fromkeys(name for row in rows for name in row if name not in HIDDEN)
     names = [name for name in shown if any(row.get(name) is not None for row in rows)]
     made = Table(title=title, title_justify="left")

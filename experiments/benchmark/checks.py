@@ -1,4 +1,4 @@
-"""Every engine has to compute the right motion before its time counts."""
+"""Checks that an engine computes the right motion, before it is timed."""
 
 from functools import cache
 
@@ -12,11 +12,11 @@ from experiments.benchmark.peers.workload import Workload, make_body, make_workl
 TOLERANCE = 1e-5
 """Largest error of a position after 100 steps, metres.
 
-Particles move by 2 cm and more in them. Rounding of float32 makes an error of 1e-6 in a cloth and
-in a rope; a stiffness wrong by one per cent makes one of 3e-4 and more.
+Particles move by 2 cm or more in these steps. Rounding of float32 gives an error of 1e-6 in a cloth
+and in a rope; a stiffness wrong by one per cent gives 3e-4 or more.
 """
 ORACLE = "edge list, float64"
-"""What engines are checked against; the edge list itself is checked against jaxsimp."""
+"""Reference engine of the check; the reference of the edge list itself is jaxsimp."""
 
 
 def check(engine: str, kind: str, side: int) -> Row:
@@ -40,7 +40,7 @@ def passes(checked: Row) -> bool:
 
 
 def compile_seconds(engine: str, kind: str, side: int) -> float:
-    """That preparing an engine for its check took: Warp compiles then, and never again."""
+    """Seconds to prepare an engine for its check: Warp compiles then, and never again."""
     return _prepared(engine, kind, side).compile_seconds
 
 
@@ -60,6 +60,6 @@ def _oracle(kind: str, side: int) -> np.ndarray:
 
 
 def _workload(kind: str, side: int) -> Workload:
-    """Few samples and steps: rounding has not grown yet."""
+    """A workload of few samples and steps, before rounding grows."""
     body = make_body(kind, side)
     return make_workload(body, population=6, num_actions=2, action_steps=50, seed=1)

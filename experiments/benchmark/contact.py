@@ -1,4 +1,4 @@
-"""Section on self-contact: what a time step of a cloth that is being folded costs more."""
+"""Section on self-contact: its additional cost per time step while a cloth is being folded."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -35,7 +35,7 @@ ACTION_SECONDS = 0.25
 
 
 def self_contact(scale: Scale) -> Iterator[Row]:
-    """A cloth folded over and settling, with and without self-contact, in turns."""
+    """A cloth that is folded and settles, with and without self-contact, in turns."""
     sides = scale.contact_sides
     ready = {
         (side, touches): prepare(partial(_fold, side, touches))
@@ -72,12 +72,12 @@ def _time_step(side: int) -> float:
 
 
 def _num_steps(side: int) -> int:
-    """Time steps of two actions that fold, and two in which nothing is held."""
+    """Number of time steps of two actions that fold, and two with nothing held."""
     return 4 * round(ACTION_SECONDS / _time_step(side))
 
 
 def _fold(side: int, touches: bool) -> partial[object]:
-    """Two corners carried over to the other two, and let go."""
+    """A rollout that carries two corners over to the other two, and lets go."""
     body = cloth((side, side))
     simulation = make_simulation(body, _time_step(side), self_contact=touches)
     pickers = make_pickers((0.2, 0.2, 0.2), steps=_num_steps(side) // 4)

@@ -17,8 +17,8 @@ def save_figures(rows: Rows, folder: Path) -> None:
     """Write a PNG of each plot that has rows.
 
     Args:
-        rows: of a run.
-        folder: made where it is not there.
+        rows: rows of a run.
+        folder: folder of the plots, created if missing.
     """
     import matplotlib.pyplot as plt
 
@@ -53,7 +53,7 @@ def plot_engines(rows: Rows) -> "Figure":
 
 
 def plot_layouts(rows: Rows) -> "Figure":
-    """Speed by chunk size, a panel for each body, a line for each number of workers."""
+    """Speed by chunk size, one panel per body, one line per number of workers."""
     import matplotlib.pyplot as plt
 
     bodies = list(dict.fromkeys(row["body"] for row in rows))
@@ -74,7 +74,7 @@ def plot_layouts(rows: Rows) -> "Figure":
 
 
 def plot_scaling(rows: Rows) -> "Figure":
-    """Time by work, a line for each sweep, with its exponent."""
+    """Time by work, one line per sweep, with its exponent."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")

@@ -1,4 +1,4 @@
-"""Times, memory and exponents: how every row of the benchmark is measured."""
+"""Times, memory and exponents: the measurements in every row of the benchmark."""
 
 import ctypes
 import time
@@ -22,39 +22,39 @@ COLUMNS = (
     "checked_against",
     "error",
 )
-"""What every row has; null where it has no meaning or was not measured."""
+"""Columns of every row; null if meaningless or not measured."""
 Row = dict[str, Any]
 
 
 def make_row(name: str, **fields: Any) -> Row:
-    """A row: the columns that every row has, and those of its section."""
+    """A row: the common columns, and those of its section."""
     return {**dict.fromkeys(COLUMNS), "name": name, **fields}
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Sizes of everything that is measured.
+    """Sizes of all measurements.
 
     Attributes:
-        repeats: of which the median is reported.
-        kinds: of bodies that rollouts and layouts are measured on.
-        rope: particles along the rope.
-        side: particles along a side of the cloths.
-        population: rollouts at a time.
-        num_actions: in a rollout.
-        action_steps: time steps of an action.
-        chunk_sizes: of the layouts, beside the whole population.
-        growth: factors by which rollouts become longer for their gradient.
-        sides: of the cloths of the first sweep.
-        populations: of the second.
-        horizons: actions of the rollouts of the third.
-        contact_sides: of the cloths that touch themselves.
-        cem_side: particles along a side of the cloth that is planned for.
-        cem_iterations: of a plan.
-        cem_plans: plans made.
-        cold_starts: processes started of each kind.
-        caches: compilation caches that they start with: none, an empty one, the one it filled.
-        goals: numbers of goals that lines are fitted to.
+        repeats: number of repeats; rows report their median.
+        kinds: kinds of bodies for rollouts and layouts.
+        rope: number of particles along the rope.
+        side: number of particles along a side of the cloths.
+        population: number of rollouts at a time.
+        num_actions: number of actions in a rollout.
+        action_steps: number of time steps of an action.
+        chunk_sizes: chunk sizes of the layouts, besides the whole population.
+        growth: factors on the length of rollouts for gradients.
+        sides: sides of the cloths of the first sweep, in particles.
+        populations: populations of the second sweep.
+        horizons: numbers of actions in the rollouts of the third sweep.
+        contact_sides: sides of the cloths with self-contact, in particles.
+        cem_side: number of particles along a side of the cloth in planning.
+        cem_iterations: number of CEM iterations of a plan.
+        cem_plans: number of plans.
+        cold_starts: number of processes started of each kind.
+        caches: compilation caches of these processes: none, an empty one, the one it filled.
+        goals: numbers of goals in the line fits.
     """
 
     repeats: int
@@ -124,13 +124,13 @@ QUICK = Scale(
 
 @dataclass(frozen=True)
 class Prepared:
-    """Something made ready to be timed.
+    """A function ready for timing.
 
     Attributes:
-        run: what is timed; it returns when its result is there.
-        result: of the first run, which is not timed.
-        compile_seconds: that making it ready took.
-        peak_megabytes: memory of the first run above that before, or None where it is unknown.
+        run: function to time; it returns when its result is complete.
+        result: result of the first run, which is not timed.
+        compile_seconds: time to prepare the function, seconds.
+        peak_megabytes: peak memory of the first run above that before, megabytes; None if unknown.
     """
 
     run: Callable[[], Any]
@@ -140,7 +140,7 @@ class Prepared:
 
 
 def prepare(make: Callable[[], Callable[[], Any]]) -> Prepared:
-    """Make something ready, and run it once."""
+    """Prepare a function, and run it once."""
     start = time.perf_counter()
     run = make()
     compile_seconds = time.perf_counter() - start
@@ -155,9 +155,9 @@ def measured(prepared: Prepared, seconds: np.ndarray, particle_steps: int | None
     """The columns of times and memory.
 
     Args:
-        prepared: what was timed.
-        seconds: its wall times.
-        particle_steps: time steps of all particles in one run, where that has a meaning.
+        prepared: the timed function.
+        seconds: wall times of its runs, seconds.
+        particle_steps: time steps of all particles in one run; None if meaningless.
     """
     run_seconds = float(np.median(seconds))
     return {
@@ -169,7 +169,7 @@ def measured(prepared: Prepared, seconds: np.ndarray, particle_steps: int | None
 
 
 def time_in_turns(runs: Sequence[Callable[[], Any]], repeats: int) -> np.ndarray:
-    """Wall times, shape (repeats, runs), in turns (A B C A B C ...): all see the same load."""
+    """Wall times, shape (repeats, runs), seconds, in turns (A B C A B C ...), for equal load."""
     seconds = np.empty((repeats, len(runs)))
     for repeat in range(repeats):
         for index, run in enumerate(runs):
@@ -192,9 +192,9 @@ def fit_exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
 
 
 def _reset_peak() -> float | None:
-    """Give free memory back, start the high-water mark anew, and return the memory in use."""
+    """Free unused memory, reset the peak, and return the memory in use, megabytes."""
     try:
-        ctypes.CDLL(None).malloc_trim(0)  # else a peak hides in what compilation left free
+        ctypes.CDLL(None).malloc_trim(0)  # memory freed by compilation would hide a peak
         Path("/proc/self/clear_refs").write_text("5")
     except (OSError, AttributeError):
         return None
@@ -202,7 +202,7 @@ def _reset_peak() -> float | None:
 
 
 def _status(field: str) -> float | None:
-    """A size in /proc/self/status, megabytes (1e6 bytes), or None where there is none."""
+    """A size in /proc/self/status, megabytes (1e6 bytes), or None if it is missing."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Sections on what is done with rollouts and around them: CEM, line fits, cold starts."""
+"""Sections on planning: CEM, line fits, cold starts."""
 
 import dataclasses
 import json
@@ -36,13 +36,13 @@ from jaxsimp.simplification.ropes import (
 from jaxsimp.tasks import make_task
 
 PLANNED_STEPS = (4, 150)
-"""Actions of a planned rollout, the last one with nothing held, and time steps of each."""
+"""Number of actions of a planned rollout, the last with nothing held, and of time steps of each."""
 LINE_SIZE = 6
-"""Key points of the lines."""
+"""Number of key points of the lines."""
 
 
 def cem(scale: Scale) -> Iterator[Row]:
-    """An iteration of CEM, and a whole plan of a diagonal fold, with the share of cores busy."""
+    """An iteration of CEM, and a whole plan of a diagonal fold, with the fraction of cores busy."""
     start = time.perf_counter()
     planner = fold_planner(scale.cem_side)
     algorithm = CEM(scale.cem_iterations, scale.population, initial_populations=1)
@@ -164,7 +164,7 @@ print(json.dumps({
 
 
 def cold_start(scale: Scale) -> Iterator[Row]:
-    """New processes: the import, and all that passes until a plan is found."""
+    """New processes: the time of the import, and the time until a plan is found."""
     found: dict[str, list[dict[str, float]]] = {}
     for _ in range(scale.cold_starts):
         with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""Sections on rollouts: of one sample, of a population, backwards, and as they grow."""
+"""Sections on rollouts: one sample, a population, gradients, and scaling."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -33,7 +33,7 @@ from jaxsimp.engines import Layout, PopulationMap, default_layout, spring_chunk_
 from jaxsimp.machine import num_cores
 
 SWEPT_POPULATION, SWEPT_HORIZON = 64, 2
-"""Where the sweeps of `scaling` meet: such that all of them are done in minutes."""
+"""Common point of the sweeps of `scaling`, small enough for sweeps of minutes."""
 SINGLE = Layout(chunk_size=1, num_workers=1)
 
 
@@ -86,7 +86,7 @@ def population(scale: Scale) -> Iterator[Row]:
 
 
 def storage(scale: Scale) -> Iterator[Row]:
-    """A population of the cloth, and of the same cloth as springs in no order, in turns."""
+    """A population of the cloth, and of the same cloth with particles in random order, in turns."""
     kinds = ("cloth", "unstructured")
     workloads = [
         make_workload(
@@ -134,7 +134,7 @@ def _layouts(kind: str, side: int, scale: Scale) -> Iterator[Row]:
 
 
 def _layout(workload: Workload, population: int) -> Layout:
-    """The layout measured to be best."""
+    """The layout that was fastest in measurements."""
     return default_layout(population, spring_chunk_size(physics(workload)[0]))
 
 
@@ -144,7 +144,7 @@ def describe(layout: Layout) -> str:
 
 
 def engines(scale: Scale) -> Iterator[Row]:
-    """A population by every engine, in turns; one that computes something else is not timed."""
+    """A population by every engine, in turns, without engines that compute wrong positions."""
     workload = _cloth(scale)
     rows: dict[str, Row] = {}
     ready: dict[str, Prepared] = {}
@@ -174,13 +174,13 @@ def engines(scale: Scale) -> Iterator[Row]:
             checking = compile_seconds(name, "cloth", scale.side)
             row["compile_seconds"] = max(row["compile_seconds"], checking)
         if name in ready and "jaxsimp" in ready:
-            # Of each turn: the load of the machine changes from one to the next.
+            # The ratio within each turn: the load of the machine changes between turns.
             row["ratio_to_jaxsimp"] = float(np.median(seconds["jaxsimp"] / seconds[name]))
         yield row
 
 
 def gradient(scale: Scale) -> Iterator[Row]:
-    """The cost of a rollout, and the same with its gradient, as actions take more steps."""
+    """The cost of a rollout, with and without its gradient, as actions take more steps."""
     functions: dict[str, Callable[..., Any]] = {
         "forward": _squared_distance,
         "gradient": jax.value_and_grad(_squared_distance),
@@ -212,7 +212,7 @@ def gradient(scale: Scale) -> Iterator[Row]:
             )
         )
         rows.append((forward, backward))
-    # Of what the compiler sets aside: it is exact, where the peak of a process is not.
+    # The compiler's temporary memory: it is exact, unlike the peak of a process.
     exponent = _exponent([backward for _, backward in rows], "steps", "temporary_megabytes")
     for forward, backward in rows:
         yield forward
@@ -220,7 +220,7 @@ def gradient(scale: Scale) -> Iterator[Row]:
 
 
 def _map_costs(function: Callable[..., Any], workload: Workload) -> PopulationMap:
-    """A function of the moves of every rollout, compiled as populations are."""
+    """A function of the moves of every rollout, compiled like a population."""
 
     def one(shared: Physics, actions: Actions) -> Any:
         return function(actions.displacement, shared, actions.pick)
@@ -231,7 +231,7 @@ def _map_costs(function: Callable[..., Any], workload: Workload) -> PopulationMa
 def _squared_distance(
     displacement: Float[Array, "T G 3"], shared: Physics, pick: Array
 ) -> Float[Array, ""]:
-    """How far the particles end from where they start: a cost that depends on every move."""
+    """Squared distance of the particles from their start: a cost that depends on every move."""
     return jnp.sum((final_position(shared, Actions(pick, displacement)) - shared[2]) ** 2)
 
 
@@ -243,7 +243,7 @@ def scaling(scale: Scale) -> Iterator[Row]:
         "population": [(side, each, horizon) for each in scale.populations],
         "horizon": [(side, population, each) for each in scale.horizons],
     }
-    # The sweeps meet in a point: it is compiled once.
+    # The sweeps have a common point: compile it once.
     points = dict.fromkeys(point for sweep in sweeps.values() for point in sweep)
     workloads = {
         (side, population, horizon): make_workload(
@@ -278,7 +278,7 @@ def scaling(scale: Scale) -> Iterator[Row]:
 
 
 def _exponent(rows: list[Row], size: str, value: str) -> float | None:
-    """The fitted exponent, or None where there is nothing to fit."""
+    """The fitted exponent, or None with too few rows to fit."""
     points = [(row[size], row[value]) for row in rows if row[value]]
     return fit_exponent(*zip(*points, strict=True)) if len(points) > 1 else None
 

@@ -22,7 +22,7 @@ FIGURES: "dict[str, Callable[[bool], tuple[Figure, str]]]" = {
     "mujoco": against_mujoco.plot_mujoco,
     "self_contact": self_contact.plot_self_contact,
 }
-"""What is drawn, by the name of the figure; each comes with a line of its numbers."""
+"""Functions that draw a figure, by its name; each also returns a line with its numbers."""
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,14 @@ class Options:
     """Figures of the physics page: convergence, energy, MuJoCo beside ours, and self-contact."""
 
     out: Path = Path("docs/figures")
-    """Folder of the figures, made where it is not there."""
+    """Folder of the figures, created if missing."""
     quick: bool = False
     """Smaller bodies and shorter motions: for tests."""
     only: tuple[str, ...] = ()
-    """Names of the figures that are made; all by default."""
+    """Names of the figures to make; all by default."""
 
     def check(self) -> None:
-        """Refuse what cannot be done, before anything is run.
+        """Check the options before any run.
 
         Raises:
             ValueError: if there is no such figure, or the folder is a file.
@@ -74,7 +74,7 @@ def save_figures(options: Options) -> None:
 
 
 def save_small(figure: "Figure", path: Path) -> None:
-    """Write a figure as PNG of at most 128 colors: a third of the size of one of all colors."""
+    """Write a figure as PNG of at most 128 colors: a third of the size with all colors."""
     from PIL import Image
 
     figure.savefig(path, dpi=110)

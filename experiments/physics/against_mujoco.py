@@ -1,4 +1,4 @@
-"""The same cloth in ours and as a flex of MuJoCo: hanging at rest, and folded by the same plan."""
+"""The same cloth in ours and as a MuJoCo flex: hanging at rest, and folded by the same plan."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,20 +26,20 @@ OURS, TOUCHING, MUJOCO = "ours", "ours with self-contact", "MuJoCo (full)"
 STYLES = {OURS: (COLORS[0], "-"), TOUCHING: (COLORS[2], "-"), MUJOCO: (COLORS[1], "--")}
 """Color and line of each engine."""
 STIFFER = 10.0
-"""Factor on stiffness of the second comparison of hanging cloths."""
+"""Factor on stiffness in the second comparison of hanging cloths."""
 
 
 # --- hanging -------------------------------------------------------------------------------------
 
 
 def hang_in_mujoco(body: Body, start: Positions, held: Sequence[int], seconds: float) -> Positions:
-    """Where a flex of the full variant is that hung from some of its particles, metres.
+    """Positions of a flex of the full variant after hanging from some of its particles, metres.
 
     Args:
-        body: that hangs.
-        start: at rest there, metres.
-        held: particles that stay where they are.
-        seconds: that it hangs.
+        body: body to hang.
+        start: positions at the start, at rest, metres.
+        held: ids of particles that stay in place.
+        seconds: duration, seconds.
 
     Raises:
         RuntimeError: if MuJoCo warned.
@@ -65,9 +65,9 @@ class Hanging:
     """A way to hang a cloth of n × n particles.
 
     Attributes:
-        held: particles that are held.
-        start: where it is at rest first, shape (N, 3), metres.
-        across: direction in which it is seen in the figure, to the right, shape (3,).
+        held: ids of the held particles.
+        start: positions at the start, at rest, shape (N, 3), metres.
+        across: direction to the right in the figure, shape (3,).
     """
 
     held: list[int]
@@ -76,7 +76,7 @@ class Hanging:
 
 
 def ways_to_hang(body: Body) -> dict[str, Hanging]:
-    """From an edge, two corners of one, and opposite corners; the latter two fall from flat."""
+    """Hanging from an edge, two corners of one, and opposite corners; these two start flat."""
     grid = np.arange(body.num_particles).reshape(body.shape)
     flat = goals.flat(body) + np.array([0.0, 0.0, 1.0])
     along, diagonal = np.array([0.0, 1.0, 0.0]), np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
@@ -88,12 +88,12 @@ def ways_to_hang(body: Body) -> dict[str, Hanging]:
 
 
 def stiffened(body: Body, factor: float) -> Body:
-    """A body whose springs are stiffer, and damped in the same proportion to critical."""
+    """A body with stiffer springs, and the same ratio of damping to critical damping."""
     return body.scaled(stiffness=factor, damping=float(np.sqrt(factor)))
 
 
 def hung(body: Body, seconds: float) -> dict[str, dict[str, Positions]]:
-    """Positions by the way it hangs, and by the engine; in air that slows it five times as much."""
+    """Positions by the way of hanging, and by engine, with five times the body's air drag."""
     slowed = body.scaled(drag=5.0)
     return {
         name: {
@@ -109,11 +109,11 @@ def hung(body: Body, seconds: float) -> dict[str, dict[str, Positions]]:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """A cloth that has been folded by hand and has settled.
+    """A cloth after a hand-made plan, settled.
 
     Attributes:
-        position: shape (N, 3), metres, in the frame of its flat start.
-        score: of its task.
+        position: positions, shape (N, 3), metres, in the frame of its flat start.
+        score: score in its task.
     """
 
     position: Positions
@@ -124,9 +124,9 @@ def folds(name: str, resolution: int, seed: int = 0) -> dict[str, Fold]:
     """The scripted plan of a task carried out in ours, ours with self-contact, and MuJoCo.
 
     Args:
-        name: of the task.
-        resolution: particles a side.
-        seed: of the start, which is turned at random.
+        name: name of the task.
+        resolution: number of particles along a side.
+        seed: seed of the start, a random turn.
     """
     task = make_task(name, resolution)
     episode = task.episode_fn(seed)
@@ -148,13 +148,13 @@ def folds(name: str, resolution: int, seed: int = 0) -> dict[str, Fold]:
 
 
 def carry_out(task: Task, episode: Episode, plan: Actions, *, self_contact: bool) -> Positions:
-    """Where a plan leaves a body in our dynamics once it has settled, metres."""
+    """Settled positions after a plan in our dynamics, metres."""
     done = MassSprings(self_contact).executor(task)(episode, plan)
     return done.positions[-1].astype(float)
 
 
 def unturned(body: Body, start: Positions, position: Positions) -> Positions:
-    """Positions turned about the vertical as takes the start to the body at rest."""
+    """Positions after the turn about the vertical that takes the start to the body at rest."""
     first, last = start[0, :2], start[-1, :2]
     rest = body.rest[-1, :2] - body.rest[0, :2]
     away = last - first
@@ -163,7 +163,7 @@ def unturned(body: Body, start: Positions, position: Positions) -> Positions:
 
 
 def middle(body: Body, diagonal: bool) -> Int[np.ndarray, " n"]:
-    """Particles along the cut square to the crease through the middle of a square cloth."""
+    """Particles along the cut perpendicular to the crease, through the middle of a square cloth."""
     grid = np.arange(body.num_particles).reshape(body.shape)
     return np.diagonal(grid) if diagonal else grid[:, len(grid) // 2]
 
@@ -171,12 +171,12 @@ def middle(body: Body, diagonal: bool) -> Int[np.ndarray, " n"]:
 def along_cut(
     body: Body, cut: Int[np.ndarray, " M"], position: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, " M"]:
-    """How far positions are along the line in which a body at rest is cut, from its middle.
+    """Coordinate of positions along the line of a cut in the body at rest, from its middle.
 
     Args:
         body: a cloth.
-        cut: particles of it along that line.
-        position: of these, in any unit.
+        cut: ids of its particles along that line.
+        position: positions of these particles, in any unit.
     """
     line = body.rest[cut[-1], :2] - body.rest[cut[0], :2]
     return position[:, :2] @ (line / np.linalg.norm(line))
@@ -203,7 +203,7 @@ def plot_mujoco(quick: bool) -> "tuple[Figure, str]":
 
 
 def _draw_hanging(figure: "SubFigure", body: Body, seconds: float) -> list[str]:
-    """How the cloth hangs, an axes each way; and how far the engines are apart, in words."""
+    """Draw the hanging cloth, one axes per way; and the engines' differences, in words."""
     ways, shapes = ways_to_hang(body), hung(body, seconds)
     stiff = hung(stiffened(body, STIFFER), seconds)
     half = [1e3 * 1.08 * np.abs(way.start @ way.across).max() for way in ways.values()]
@@ -231,7 +231,7 @@ def _draw_hanging(figure: "SubFigure", body: Body, seconds: float) -> list[str]:
 
 
 def _draw_grid(axes: "Axes", seen: Float[np.ndarray, "n n 2"], engine: str) -> None:
-    """Some lines of a cloth's grid, its outline among them."""
+    """Draw some lines of a cloth's grid, with its outline."""
     color, line = STYLES[engine]
     every = max(1, (len(seen) - 1) // 6)
     for lines in (seen[::every], seen[:, ::every].swapaxes(0, 1)):
@@ -241,7 +241,7 @@ def _draw_grid(axes: "Axes", seen: Float[np.ndarray, "n n 2"], engine: str) -> N
 
 
 def _draw_folds(axes: "Axes", name: str, body: Body) -> str:
-    """Cuts through a fold in every engine; and scores and distances from MuJoCo's, in words."""
+    """Draw cuts through a fold in every engine; and scores and distances from MuJoCo, in words."""
     found = folds(name, body.shape[0])
     cut = middle(body, "diagonal" in name)
     words = []

@@ -1,4 +1,4 @@
-"""What figures share: rollouts, cloths that hang at rest, and how far shapes are apart."""
+"""Common parts of the figures: rollouts, cloths hanging at rest, and distances of shapes."""
 
 from collections.abc import Sequence
 
@@ -19,13 +19,13 @@ run = jax.jit(rollout, static_argnames=("observe", "adjoint"))
 
 
 def hang(body: Body, start: Positions, held: Sequence[int], seconds: float) -> Positions:
-    """Where a body is that hung from some of its particles for a while, metres.
+    """Positions of a body after hanging from some of its particles, metres.
 
     Args:
-        body: that hangs, and passes through itself.
-        start: at rest there, off the table, metres.
-        held: particles that stay where they are.
-        seconds: that it hangs.
+        body: body to hang, without self-contact.
+        start: positions at the start, at rest, off the table, metres.
+        held: ids of particles that stay in place.
+        seconds: duration, seconds.
     """
     time_step = min(2e-3, 0.9 * largest_time_step(body))
     simulation = make_simulation(body, time_step, GRAVITY)
@@ -45,5 +45,5 @@ def upright(body: Body, height: float = 1.0) -> Positions:
 
 
 def rms(difference: Float[np.ndarray, "*T N 3"]) -> float:
-    """Root-mean-square length of differences, in their unit."""
+    """Root-mean-square length of differences, in the unit of the differences."""
     return float(np.sqrt((difference**2).sum(axis=-1).mean()))

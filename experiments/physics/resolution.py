@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 
 def folded(resolution: int, side: float = 0.3) -> np.ndarray:
-    """A cloth after two pickers carried one side over onto the other, shape (n, n, 3), metres.
+    """Positions of a cloth after two pickers folded it in half, shape (n, n, 3), metres.
 
     Args:
-        resolution: particles a side, `n`.
-        side: of the square, metres.
+        resolution: number of particles along a side, `n`.
+        side: side of the square, metres.
     """
     body = cloth((resolution, resolution), (side, side))
     time_step = min(2e-3, 0.9 * largest_time_step(body))
@@ -43,12 +43,12 @@ def folded(resolution: int, side: float = 0.3) -> np.ndarray:
 
 
 def hanging(resolution: int, seconds: float = 4.0, side: float = 0.3) -> np.ndarray:
-    """A cloth that hangs at rest from its upper edge, shape (n, n, 3), metres.
+    """Positions of a cloth that hangs at rest from its upper edge, shape (n, n, 3), metres.
 
     Args:
-        resolution: particles a side, `n`.
-        seconds: that it is given to come to rest, in air that slows it five times as much.
-        side: of the square, metres.
+        resolution: number of particles along a side, `n`.
+        seconds: time to come to rest, seconds, with five times the body's air drag.
+        side: side of the square, metres.
     """
     body = cloth((resolution, resolution), (side, side), drag=15.0)
     edge = range(resolution * (resolution - 1), resolution**2)
@@ -88,6 +88,6 @@ def plot_resolution(quick: bool) -> "tuple[Figure, str]":
 
 
 def _draw_outline(axes: "Axes", shape: np.ndarray, color: str) -> None:
-    """The four sides of a cloth, seen along x."""
+    """Draw the four sides of a cloth, seen along x."""
     sides = np.concatenate([shape[0], shape[:, -1], shape[-1, ::-1], shape[::-1, 0]])
     axes.plot(*sides[:, 1:].T, color=color, lw=1)

@@ -1,4 +1,4 @@
-"""A cloth folded twice, with self-contact and without, and how far its layers are apart."""
+"""A cloth folded twice, with self-contact and without, and the distances of its layers."""
 
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 LEAST = 0.8
-"""Thicknesses that particles of a settled stack should be apart."""
+"""Smallest distance wanted of particles in a settled stack, in thicknesses."""
 STYLES = {False: ("without self-contact", COLORS[0]), True: ("with self-contact", COLORS[2])}
 """Name and color, by whether the cloth touches itself."""
 
@@ -36,13 +36,13 @@ def folded_twice(
     """A square cloth folded along one diagonal, the x axis, then the other, and settled.
 
     Args:
-        resolution: particles a side.
-        self_contact: whether it touches itself.
-        share: of the way to the opposite corner that a corner is carried.
-        lift: how high, metres.
+        resolution: number of particles along a side.
+        self_contact: whether the cloth touches itself.
+        share: displacement of a corner, as a fraction of the way to the opposite corner.
+        lift: height of the lift, metres.
 
     Returns:
-        Positions, shape (N, 3), metres, and the contacts whose particles got past each other.
+        Positions, shape (N, 3), metres, and the number of tunnelled contacts.
     """
     body = cloth((resolution, resolution))
     time_step = min(2e-3, 0.9 * largest_time_step(body))
@@ -72,23 +72,23 @@ def over(way: Float[np.ndarray, "3"], lift: float, gap: float) -> Float[np.ndarr
 
 
 def nearest_particles(body: Body, position: Positions, adjacent: float) -> Float[np.ndarray, " N"]:
-    """From each particle to the nearest one that it may touch, metres.
+    """Distance from each particle to the nearest one that can touch it, metres.
 
     Args:
         body: a sheet.
-        position: metres.
-        adjacent: particles that are closer at rest do not touch, metres.
+        position: positions, metres.
+        adjacent: rest distance, metres, below which particles do not touch.
     """
     return np.where(_may_touch(body, adjacent), _distances(position), np.inf).min(axis=1)
 
 
 def nearest_triangles(body: Body, position: Positions, adjacent: float) -> Float[np.ndarray, " N"]:
-    """From each particle to the nearest triangle all of whose corners it may touch, metres.
+    """Distance from each particle to the nearest triangle whose corners can all touch it, metres.
 
     Args:
         body: a sheet.
-        position: metres.
-        adjacent: particles that are closer at rest do not touch, metres.
+        position: positions, metres.
+        adjacent: rest distance, metres, below which particles do not touch.
     """
     from trimesh.triangles import closest_point
 
@@ -113,13 +113,13 @@ def cut(
     place: Float[np.ndarray, "3"],
     normal: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "M 2 3"]:
-    """Where a plane cuts the triangles of a body: ends of line segments, metres.
+    """Line segments in which a plane cuts the triangles of a body: their ends, metres.
 
     Args:
         body: a sheet.
-        position: metres.
-        place: in the plane, metres.
-        normal: of the plane.
+        position: positions, metres.
+        place: point of the plane, metres.
+        normal: normal of the plane.
     """
     from trimesh import Trimesh
     from trimesh.intersections import mesh_plane
@@ -131,7 +131,7 @@ def cut(
 
 
 def plot_self_contact(quick: bool) -> "tuple[Figure, str]":
-    """The cloth in 3-D and cut, without and with; and the distances of its layers."""
+    """The cloth in 3-D and cut, without and with self-contact; and the distances of its layers."""
     import matplotlib.pyplot as plt
 
     resolution = 9 if quick else 25
@@ -147,7 +147,7 @@ def plot_self_contact(quick: bool) -> "tuple[Figure, str]":
         _draw_cut(left.add_subplot(grid[1, column]), body, position, color)
         words = _draw_distances(shares, body, position, name, color)
         lines.append(
-            f"{name}: {1e3 * np.ptp(position[:, 2]):.0f} mm high, {missed} missed, {words}"
+            f"{name}: {1e3 * np.ptp(position[:, 2]):.0f} mm high, {missed} tunnelled, {words}"
         )
     shares.axvline(LEAST, color=GOAL_COLOR, lw=1)
     shares.text(LEAST + 0.04, 0.97, f"{LEAST:.0%}", color="#666666", va="top")
@@ -158,7 +158,7 @@ def plot_self_contact(quick: bool) -> "tuple[Figure, str]":
 
 
 def _draw_body(axes: "Axes3D", body: Body, position: Positions, name: str, color: str) -> None:
-    """From where the loose corners are, equal scales, without axes."""
+    """Draw the cloth, seen from the loose corners, with equal scales, without axes."""
     draw_body(axes, body, position, color)
     low, high = position.min(axis=0), position.max(axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
@@ -169,7 +169,7 @@ def _draw_body(axes: "Axes3D", body: Body, position: Positions, name: str, color
 
 
 def _draw_cut(axes: "Axes", body: Body, position: Positions, color: str) -> None:
-    """The plane along the first crease through the mean of all particles."""
+    """Draw the cut in the plane along the first crease through the mean of all particles."""
     place = position.mean(axis=0)
     for ends in 1e3 * cut(body, position, place, np.array([0.0, 1.0, 0.0])):
         axes.plot(*ends[:, [0, 2]].T, color=color, lw=1.2, solid_capstyle="round")
@@ -178,7 +178,7 @@ def _draw_cut(axes: "Axes", body: Body, position: Positions, color: str) -> None
 
 
 def _draw_distances(axes: "Axes", body: Body, position: Positions, name: str, color: str) -> str:
-    """Shares of the particles that are closer than each distance; in words, too."""
+    """Draw the fraction of particles closer than each distance; and return it in words."""
     touching = make_simulation(body, 1e-3, self_contact=True).self_contact
     assert touching is not None
     words = []

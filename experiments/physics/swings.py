@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 HIGH = np.array([0.0, 0.0, 1.0])
-"""Lift that keeps a swinging body off the table, metres."""
+"""Displacement that keeps a swinging body off the table, metres."""
 
 
 def swing(body: Body, time_step: float, seconds: float, frames: int) -> State:
-    """States while the body swings from its first particle, off the table, a first axis `frames`.
+    """States of a body that swings from its first particle, off the table, a first axis `frames`.
 
     Args:
-        body: flat and at rest at first.
-        time_step: about what is taken, seconds: a whole number of them fills a frame.
-        seconds: of the whole motion.
-        frames: states that are kept.
+        body: the body, flat and at rest at the start.
+        time_step: approximate time step, seconds: a whole number of them fills a frame.
+        seconds: duration of the motion, seconds.
+        frames: number of states to keep.
     """
     steps = round(seconds / frames / time_step)
     simulation = make_simulation(body, seconds / frames / steps, GRAVITY)
@@ -54,15 +54,15 @@ def _whole(state: State) -> State:
 def time_step_errors(
     body: Body, seconds: float, divisors: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Time steps, and RMS errors of a swing's end at each of them, metres.
+    """Time steps, seconds, and the RMS error of a swing's end state at each, metres.
 
-    The truth is extrapolated from time steps 4 and 8 times shorter than the shortest, as from a
+    The reference is extrapolated from time steps 4 and 8 times shorter than the shortest, as for a
     method of first order, in float64.
 
     Args:
-        body: that swings.
-        seconds: of the swing.
-        divisors: of nine tenths of the largest stable time step.
+        body: the swinging body.
+        seconds: duration of the swing, seconds.
+        divisors: divisors of nine tenths of the largest stable time step.
     """
     with jax.enable_x64(True):
         coarsest = seconds / np.ceil(seconds / (0.9 * largest_time_step(body)))
@@ -123,13 +123,13 @@ def energy(body: Body, states: State) -> Float[np.ndarray, " T"]:
 
 
 def energies(body: Body, part: float, seconds: float, frames: int) -> np.ndarray:
-    """Energy of a swing less that of its start, over the weight times the body's size.
+    """Change of energy in a swing since its start, over the weight times the body's size.
 
     Args:
-        body: that swings.
-        part: of the largest stable time step that is taken.
-        seconds: of the swing.
-        frames: at which energy is taken.
+        body: the swinging body.
+        part: time step, as a fraction of the largest stable one.
+        seconds: duration of the swing, seconds.
+        frames: number of states with energy.
     """
     with jax.enable_x64(True):
         states = swing(body, part * largest_time_step(body), seconds, frames)

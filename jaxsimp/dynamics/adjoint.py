@@ -1,7 +1,7 @@
 """The time steps of an action, and their adjoint in memory of the square root of their number.
 
-Reverse mode keeps the states that `sqrt(S)` segments of the S steps start from. Backwards,
-it takes the steps of one segment again, keeping its states, and then their adjoints.
+Reverse mode keeps the states at the start of `sqrt(S)` segments of the S steps. The backward pass
+repeats the steps of one segment, keeps their states, and then takes their adjoints.
 """
 
 import math
@@ -22,7 +22,7 @@ from jaxsimp.dynamics.step import Axes, Motion, Packed, step, step_and_free, ste
 def plain_steps(
     simulation: Simulation, packed: Packed, motion: Motion, shares: Float[Array, " S"]
 ) -> Packed:
-    """Time steps in which held particles move by shares of their drive."""
+    """Time steps in which held particles move by fractions of their drive."""
 
     def one(packed: Packed, share: Float[Array, ""]) -> tuple[Packed, None]:
         return step(simulation, packed, motion, share), None
@@ -38,7 +38,7 @@ def steps(
     return _steps(tree, leaves, packed, motion.held, motion.drive, shares)
 
 
-# Of leaves, not of a `Simulation`: JAX makes trees of things that are no arrays here.
+# Leaves, not a `Simulation`: JAX builds trees of objects that are not arrays here.
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _steps(
     tree: PyTreeDef,
@@ -57,15 +57,15 @@ def _steps(
 
 
 Shared = tuple[list[Any], Float[Array, " S"]]
-"""Leaves of the simulation, and the shares: what is the same for all samples of a batch."""
+"""Leaves of the simulation, and the shares; the same for all samples of a batch."""
 Starts = tuple[Float[Array, "segments 3 NHH *B"], Float[Array, "segments 3 NHH *B"]]
-"""States that segments of the steps start from."""
+"""States at the start of segments."""
 Kept = tuple[Shared, tuple[Any, Any], Starts, list[Any] | None]
 """Arguments, states at the start of segments, and zero cotangents of the simulation, if wanted."""
 
 
 def _forward(tree: PyTreeDef, *arguments: Any) -> tuple[Packed, Kept]:
-    """The steps, and what their adjoint needs."""
+    """Take the steps, and keep the inputs of their adjoint."""
     wanted = any(leaf.perturbed for leaf in arguments[0])
     leaves, packed, held, drive, shares = jax.tree.map(
         lambda leaf: jnp.asarray(leaf.value),
@@ -92,7 +92,7 @@ def _forward(tree: PyTreeDef, *arguments: Any) -> tuple[Packed, Kept]:
 
 
 Recorded = tuple[Packed, Axes]
-"""A state, and the velocities without contact after the step from there."""
+"""A state, and the velocities after the next step without contact."""
 Bars = tuple[Simulation | None, tuple[Axes, Axes], Axes]
 """Cotangents of the simulation, if wanted, of the state without halo, and of the drive."""
 
@@ -100,7 +100,7 @@ Bars = tuple[Simulation | None, tuple[Axes, Axes], Axes]
 def _backward(
     tree: PyTreeDef, kept: Kept, packed_bar: Any
 ) -> tuple[list[Any] | None, Packed, None, Float[Array, "3 N"], None]:
-    """Segment by segment from the last: its steps again, then their adjoints backwards."""
+    """Repeat the steps of each segment, from the last one, and take their adjoints backwards."""
     shared, motion, starts, zeros = kept
     packed_bar = jax.tree.map(_dense, packed_bar, is_leaf=_is_zero)
 
@@ -162,8 +162,8 @@ def _adjoint_steps(
             )
             if simulation_bar is not None:
                 simulation_bar = jax.tree.map(jnp.add, simulation_bar, more)
-            # The state of the next turn is carried: XLA would look it up in `states` anew for
-            # each of its uses, element by element.
+            # Carry the state of the next turn: otherwise XLA reads it from `states` again for each
+            # of its uses, element by element.
             drive_bar = [a + b for a, b in zip(drive_bar, drive_more, strict=True)]
             return (simulation_bar, packed_bar, drive_bar), state_at(i - 1)
 
@@ -194,12 +194,12 @@ _steps.defvjp(_forward, _backward, symbolic_zeros=True)
 
 
 def _simulation(tree: PyTreeDef, leaves: list[Any]) -> Simulation:
-    # JAX hands on constants as NumPy arrays.
+    # JAX passes constants on as NumPy arrays.
     return jax.tree.unflatten(tree, [jnp.asarray(leaf) for leaf in leaves])
 
 
 def _segments(count: int) -> Int[np.ndarray, "segments 2"]:
-    """First and end of about `sqrt(count)` runs of as many steps each."""
+    """First and end step of about `sqrt(count)` segments of about `sqrt(count)` steps each."""
     length = math.isqrt(max(count - 1, 0)) + 1
     first = np.arange(0, count, length)
     return np.stack([first, np.minimum(first + length, count)], axis=1)

@@ -1,4 +1,4 @@
-"""Where the axis of a batch goes: last, inside time steps, whatever axis `vmap` was given."""
+"""Position of the batch axis: last inside time steps, whatever the axis of `vmap`."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,12 +11,12 @@ from jaxtyping import Array, PyTree
 def batch_last(
     fn: Callable[[PyTree[Any], PyTree[Any]], PyTree[Any]],
 ) -> Callable[[PyTree[Any], PyTree[Any]], PyTree[Any]]:
-    """The function, which under `vmap` over its second argument gets the batch as last axis.
+    """The function, with the batch as last axis under `vmap` over its second argument.
 
     Args:
-        fn: of what all samples share and of what each has; pure JAX, and written so that a
-            further last axis on every leaf of the second argument is one on every leaf of the
-            result. Under `vmap` over the first argument, too, it is batched as any function.
+        fn: function of an argument common to all samples, and of one per sample; pure JAX. An
+            additional last axis on every leaf of the second argument must give one on every leaf
+            of the result. Under `vmap` over the first argument, too, JAX batches it as usual.
     """
     wrapped = jax.custom_batching.custom_vmap(fn)
 

@@ -14,11 +14,11 @@ NONE = -1
 @partial(jax.tree_util.register_dataclass, data_fields=["pick", "displacement"], meta_fields=[])
 @dataclass(frozen=True)
 class Actions:
-    """A plan: what each picker grasps and how far it moves (Eq. 1 of the paper).
+    """A plan: the particle and the displacement of each picker (Eq. 1 of the paper).
 
     Attributes:
         pick: particle ids, or `NONE`, shape (T, G), or (G,) for one action.
-        displacement: shape (T, G, 3), or (G, 3), metres.
+        displacement: displacements of the pickers, shape (T, G, 3), or (G, 3), metres.
     """
 
     pick: Int[Array, "*T G"]
@@ -30,12 +30,13 @@ class Actions:
 )
 @dataclass(frozen=True)
 class Pickers:
-    """How pickers may move.
+    """Limits of the pickers' motion.
 
     Attributes:
         limits: largest displacement of one action along x, y, z, shape (3,), metres.
-        max_stretch: two held particles must stay closer than this times their rest distance.
-        steps: time steps that one action takes, static.
+        max_stretch: upper bound on the distance of two held particles, as a multiple of their rest
+            distance.
+        steps: number of time steps of one action; static.
     """
 
     limits: Float[Array, "... 3"]
@@ -64,7 +65,7 @@ def make_pickers(
 
 
 def speed_profile(steps: int) -> Float[Array, " steps"]:
-    """Share of a displacement made in each time step: starts and ends at rest, sums to 1.
+    """Fraction of a displacement in each time step: starts and ends at rest, sums to 1.
 
     The parabola 6 t (1 - t) of a cubic position profile, sampled at the middle of each step.
     """
@@ -80,30 +81,30 @@ def grasp(
     position: Float[Array, "N 3"],
     action: Actions,
 ) -> tuple[Bool[Array, " N"], Float[Array, "N 3"]]:
-    """Which particles are held during an action, and where each of them is carried.
+    """Held particles during an action, and their displacements.
 
-    Displacements are clipped to the limits and to the table. A particle goes to the first
-    picker that names it. The motion of two pickers is refused, C(a) < 0 of Eq. 2, when it
-    would end with their particles at `max_stretch` times their rest distance or farther; both
-    then hold still, which may refuse the motion of a third. (On a straight path the distance of
-    two particles is convex in time, so no state on the way is farther apart than both its ends.)
+    `grasp` clips displacements to the limits and to the table. If several pickers name a particle,
+    the first one holds it. Two pickers violate the stretch rule, C(a) < 0 of Eq. 2, if their
+    particles would end at `max_stretch` times their rest distance or farther; both then hold
+    still, so a third may violate the rule too. (On a straight path the distance of two particles
+    is convex in time, so it is never larger than at both ends.)
 
     Args:
-        pickers: the limits.
+        pickers: limits of the pickers' motion.
         rest: rest coordinates of the body, metres.
         floor: lowest height of a particle, metres.
-        position: of the particles, metres.
+        position: positions of the particles, metres.
         action: one action, shapes (G,) and (G, 3).
 
     Returns:
-        held: shape (N,).
-        displacement: of each held particle, zero elsewhere, shape (N, 3), metres.
+        held: whether a picker holds each particle, shape (N,).
+        displacement: displacement of each held particle, zero elsewhere, shape (N, 3), metres.
     """
     holds = _holds(action.pick, len(position))
     start = position[action.pick]
     target = start + jnp.clip(action.displacement, -pickers.limits[None], pickers.limits[None])
     target = target.at[:, 2].max(floor)
-    for _ in range(max(1, len(holds) - 1)):  # a pass that changes something stops a picker
+    for _ in range(max(1, len(holds) - 1)):  # each pass that changes anything stops a picker
         allowed = _allowed(pickers, rest[action.pick], target, holds)
         target = jnp.where(allowed[:, None], target, start)
     moves = target - start

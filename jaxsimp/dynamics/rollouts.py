@@ -1,6 +1,6 @@
 """Rollouts: semi-implicit Euler steps of a simulation under actions, as `jax.lax.scan`.
 
-Pure functions of arrays: `jit`, `vmap` and `grad` apply. Gradients are taken by the adjoint of
+Pure functions of arrays: `jit`, `vmap` and `grad` apply. Reverse mode uses the adjoint of
 adjoint.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`.
 """
 
@@ -31,12 +31,12 @@ def rollout(
 
     Args:
         simulation: the body's physics.
-        pickers: how the pickers may move.
-        state: at the start, shapes (N, 3).
-        actions: shapes (T, G) and (T, G, 3).
-        observe: applied to the state at the end of each action.
-        adjoint: differentiate by the adjoint of adjoint.py, in reverse mode only; False leaves
-            differentiation to JAX: in either mode, but reverse takes many times as long.
+        pickers: limits of the pickers' motion.
+        state: state at the start, shapes (N, 3).
+        actions: the plan, shapes (T, G) and (T, G, 3).
+        observe: function applied to the state at the end of each action.
+        adjoint: whether to differentiate by the adjoint of adjoint.py, in reverse mode only; False
+            leaves differentiation to JAX, in either mode, but reverse takes many times as long.
 
     Returns:
         The state at the end of the last action, and the observations stacked along a first
@@ -56,7 +56,7 @@ def rollout_observing(
     *,
     adjoint: bool = True,
 ) -> tuple[State, PyTree[Any]]:
-    """`rollout`, but `observe` is applied to the state at the end of each action and the action."""
+    """`rollout`, but `observe` takes the state at the end of each action, and the action."""
     advance = steps if adjoint else plain_steps
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:

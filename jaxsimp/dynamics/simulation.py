@@ -1,4 +1,4 @@
-"""Simulations: a body made ready to be stepped, with a time step proven stable."""
+"""Simulations: the physics of a body as arrays, with a time step proven stable."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +13,7 @@ from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_
 from jaxsimp.dynamics.springs import Springs, make_springs
 
 PHYSICS = ("mass", "radius", "drag", "friction", "gravity", "time_step")
-"""Fields of `Simulation` that velocities depend on, besides springs: those with a cotangent."""
+"""Fields of `Simulation`, besides springs, with a cotangent: velocities depend on them."""
 
 
 @partial(
@@ -28,9 +28,9 @@ class State:
     Here and below `...` stands for the axes that `jax.vmap` and `jax.lax.map` add.
 
     Attributes:
-        position: shape (N, 3), metres.
-        velocity: shape (N, 3), metres per second.
-        missed: what self-contact did not hold back so far, see `Contacts`; None without it.
+        position: positions, shape (N, 3), metres.
+        velocity: velocities, shape (N, 3), metres per second.
+        missed: tunnelled contacts so far, see `Contacts`; None without self-contact.
     """
 
     position: Float[Array, "... N 3"]
@@ -50,13 +50,13 @@ class Simulation:
     Attributes:
         springs: stiffness, damping and rest lengths.
         rest: rest coordinates, shape (N, 3), metres.
-        mass: shape (N,), kilograms.
-        radius: height of a particle that lies on the table, metres.
+        mass: masses, shape (N,), kilograms.
+        radius: height of a particle on the table, metres.
         drag: air drag, per second.
         friction: Coulomb coefficient with the table.
         gravity: downward acceleration, metres per second squared.
-        time_step: seconds.
-        self_contact: how the body touches itself; None where it passes through itself.
+        time_step: time step, seconds.
+        self_contact: contacts of the body with itself; None for a body that passes through itself.
     """
 
     springs: Springs
@@ -81,12 +81,12 @@ def make_simulation(
     """The simulation of a body.
 
     Args:
-        body: what is simulated.
-        time_step: seconds, at most `largest_time_step(body)`.
+        body: body to simulate.
+        time_step: time step, seconds, at most `largest_time_step(body)`.
         gravity: downward acceleration, metres per second squared.
         self_contact: whether layers rest on each other and rub, see `make_self_contact`; the
             body passes through itself otherwise.
-        top_speed: fastest that a picker moves, metres per second; matters to self-contact only.
+        top_speed: largest speed of a picker, metres per second; for self-contact only.
 
     Raises:
         ValueError: if the time step is not positive, or is unstable for the body's stiffness,
@@ -95,7 +95,7 @@ def make_simulation(
     """
     largest = largest_time_step(body)
     if not 0 < time_step <= largest:
-        # The message rounds down: the number that it names is stable.
+        # Round down, so that the time step in the message is stable.
         raise ValueError(
             f"time_step is {time_step:.4g} s; this {body.name} is stable from above 0 to "
             f"{largest * (1 - 5e-4):.4g} s. Take a smaller time step, a lower stiffness or "
@@ -134,13 +134,12 @@ def largest_time_step(body: Body) -> float:
     Semi-implicit Euler on `x'' = -K x - C x'` is stable while `4 - 2 c dt - k dt^2 >= 0` and
     `c dt <= 2` for every Rayleigh quotient `k` of K and `c` of C. In any configuration the
     stiffness of a spring is at most `k I`, so K is bounded by the graph Laplacian of the
-    springs, weighed by stiffness and scaled by mass, and C by that weighed by damping, plus
-    drag. For a body along a line whose damping is in proportion to its stiffness, the bound is
-    attained.
+    springs, weighted by stiffness and scaled by mass, and C by that weighted by damping, plus
+    drag. A body along a line whose damping is in proportion to its stiffness attains the bound.
 
-    The bound is of each configuration by itself. A body with next to no damping (a spring under
-    3 % of critical) also gains energy, slowly, from its configurations changing at this rate:
-    half the step is safe for it.
+    The bound holds for each fixed configuration. A body with almost no damping (a spring under
+    3 % of critical) also gains energy, slowly, as its configuration changes between steps; half
+    the time step is safe for it.
     """
     k = _largest_eigenvalue(body, body.stiffness)
     c = _largest_eigenvalue(body, body.damping) + body.material.drag
@@ -165,7 +164,7 @@ def _largest_eigenvalue(body: Body, weight: np.ndarray) -> float:
     laplacian = sparse.csr_array((values, (rows, columns)), shape=(count, count))
     if count < 64:
         return float(np.linalg.eigvalsh(laplacian.toarray())[-1])
-    # A fixed start vector, for a result that is the same at every call.
+    # A fixed start vector makes the result the same at every call.
     start = np.random.default_rng(0).standard_normal(count)
     tolerance = 1e-4
     found = sparse.linalg.eigsh(

@@ -5,12 +5,12 @@ Springs are stored in rows, a row with at most one spring from each particle:
 - By offset, where ids of neighbours differ by few distinct offsets `j - i` (2 in a rope, 6 in a
   row-major grid): the springs of one offset are a shifted copy of the particles, and forces
   become sums of shifted arrays. This is diagonal (DIA) storage of the spring matrix.
-- By neighbour, for any other body: row `s` holds the `s`-th spring of each particle, so that
-  each spring is there twice, once from either end. This is ELLPACK storage.
+- By neighbour, for any other body: row `s` holds the `s`-th spring of each particle, so each
+  spring is stored twice, once from either end. This is ELLPACK storage.
 
 Inside a simulation positions and velocities are (3, N + 2 H, *B): x, y, z as rows, with a halo
 of `H` inert particles, the largest offset or 0, at either end, so that every shift stays in
-bounds. `*B` are axes of a batch: last, so that the same particle of all samples is contiguous.
+bounds. `*B` are axes of a batch: last, so that the samples of one particle are contiguous.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from jaxsimp.bodies import Body
 
 MOST_OFFSETS = 16
-"""Bodies with more distinct offsets are stored by neighbour."""
+"""Largest number of distinct offsets for storage by offset."""
 
 
 @partial(
@@ -38,15 +38,15 @@ class Springs:
     """The springs of a body, by offset or by neighbour.
 
     Row `d`, column `H + i` is the spring from particle `i` to `i + offsets[d]`, or, where there
-    are no offsets, to `neighbours[d, i]`. Stiffness and damping are zero where there is none.
+    are no offsets, to `neighbours[d, i]`. Entries without a spring have zero stiffness and damping.
 
     Attributes:
         offsets: distinct values of `j - i`, ascending, static; empty for storage by neighbour.
         neighbours: particle ids, shape (D, N); `D` is 0 for storage by offset.
-        stiffness: shape (D, H + N), newtons per metre.
-        damping: shape (D, H + N), newton-seconds per metre.
-        rest_length: shape (D, H + N), metres.
-        shortest: length under which a spring's direction is regularised, metres.
+        stiffness: stiffnesses, shape (D, H + N), newtons per metre.
+        damping: damping coefficients, shape (D, H + N), newton-seconds per metre.
+        rest_length: rest lengths, shape (D, H + N), metres.
+        shortest: length below which a spring's direction is regularised, metres.
     """
 
     offsets: tuple[int, ...]
@@ -63,7 +63,7 @@ class Springs:
 
 
 def make_springs(body: Body) -> Springs:
-    """The springs of a body, by offset if they have at most `MOST_OFFSETS`, or by neighbour."""
+    """The springs of a body, by offset if they have at most `MOST_OFFSETS`, else by neighbour."""
     low, high = body.springs.min(axis=1), body.springs.max(axis=1)
     distinct, row = np.unique(high - low, return_inverse=True)
     if len(distinct) <= MOST_OFFSETS:
@@ -90,7 +90,7 @@ def make_springs(body: Body) -> Springs:
         stiffness=in_rows(body.stiffness),
         damping=in_rows(body.damping),
         rest_length=in_rows(body.rest_length),
-        # A thousandth of a spring: far below any state of interest, far above rounding.
+        # A thousandth of a spring: far below any length of interest, far above rounding.
         shortest=jnp.asarray(1e-3 * body.rest_length.min(initial=1.0), dtype=float),
     )
 
@@ -101,14 +101,13 @@ def spring_tensions(
     """Force of each spring over the distance of its ends, newtons per metre, by offset.
 
     Hooke's law with damping along the spring: the force on `i` towards `j` is
-    `k (r - L) + c dr/dt`. Ends closer than `springs.shortest` are treated as that far apart
-    along their difference, so that force and gradient stay finite, and the force is zero,
-    where they coincide.
+    `k (r - L) + c dr/dt`. Ends closer than `springs.shortest` count as that far apart along their
+    difference, so force and gradient stay finite, and the force is zero, where the ends coincide.
 
     Args:
-        springs: of the body.
-        position: with halo, metres.
-        velocity: with halo, metres per second.
+        springs: springs of the body.
+        position: positions with halo, metres.
+        velocity: velocities with halo, metres per second.
     """
     tensions = []
     for row in range(len(springs.stiffness)):
@@ -117,8 +116,8 @@ def spring_tensions(
         squared = jnp.maximum(_dot(along, along), springs.shortest**2)
         stretch = squared - rest_length * jnp.sqrt(squared)
         force = stiffness * stretch + damping * _dot(along, speed)
-        # The division comes last because XLA holds it too dear to repeat: it keeps the tension
-        # in memory, where it would otherwise compute it again for each of its six uses.
+        # The division comes last because XLA does not repeat divisions: it keeps the tension in
+        # memory; otherwise it would compute it again for each of its six uses.
         tensions.append(force / squared)
     return tensions
 
@@ -128,12 +127,12 @@ def pull(
 ) -> list[Float[Array, "N *B"]]:
     """Along each axis: the sum over a particle's springs of `weight (value_other - value_self)`.
 
-    The forces of the springs, newtons, when the weights are tensions and the values positions.
+    With tensions as weights and positions as values, these are the spring forces, newtons.
 
     Args:
-        springs: of the body.
-        weights: of the springs, by offset.
-        values: of the particles, with halo.
+        springs: springs of the body.
+        weights: weights of the springs, by offset.
+        values: values of the particles, with halo.
     """
     return [_pull(springs, weights, values[axis]) for axis in range(3)]
 
@@ -170,7 +169,7 @@ def spring_forces_vjp(
     velocity: Float[Array, "3 NHH *B"],
     force_bar: Float[Array, "3 NHH *B"],
 ) -> tuple[list[Float[Array, "N *B"]], list[Float[Array, "N *B"]]]:
-    """Cotangents of positions and velocities for one of the spring forces.
+    """Cotangents of positions and velocities, from a cotangent of the spring forces.
 
     Let `d`, `w` and `e` be the differences of position, velocity and `force_bar` between a
     spring's ends. The force on its first end is `t d`, so the cotangent of `t` is `-e.d`, and
@@ -179,14 +178,14 @@ def spring_forces_vjp(
         -t e + a w + b d  and  a d,  with  a = -(e.d) dt/d(d.w),  b = -2 (e.d) dt/d(d.d):
 
     the cotangents of particles are pulls with the weights t, a and b. JAX's own transpose turns
-    every shifted slice into a padded copy, and is many times slower. The differences of positions
-    are written in a form of its own for each of the loops that take them, see `_subtract`.
+    every shifted slice into a padded copy, and is many times slower. Each loop that takes
+    differences of positions writes them in a different form, see `_subtract`.
 
     Args:
-        springs: of the body.
-        tensions: of its springs.
-        position: with halo, metres.
-        velocity: with halo, metres per second.
+        springs: springs of the body.
+        tensions: tensions of the springs.
+        position: positions with halo, metres.
+        velocity: velocities with halo, metres per second.
         force_bar: cotangent of the forces, with halo.
     """
     by_rate, by_square = [], []
@@ -220,13 +219,13 @@ def springs_vjp(
     velocity: Float[Array, "3 NHH"],
     force_bar: Float[Array, "3 NHH"],
 ) -> Springs:
-    """Cotangents of the springs themselves for one of their forces; see `spring_forces_vjp`."""
+    """Cotangents of the springs, from a cotangent of their forces; see `spring_forces_vjp`."""
     stiffness_bar, damping_bar, rest_length_bar = [], [], []
     shortest_bar = jnp.zeros_like(springs.shortest)
     for row, tension in enumerate(tensions):
         along, speed = _difference(springs, row, position), _difference(springs, row, velocity)
         stiffness, damping, rest_length = _row(springs, row, along[0])
-        # A spring that is stored twice acts on one end each time.
+        # Each of the two entries of a spring stored twice acts on one end.
         apart = _difference(springs, row, force_bar) if springs.offsets else list(-force_bar)
         tension_bar = -_dot(along, apart)
         square, least, rate = _dot(along, along), springs.shortest**2, _dot(along, speed)
@@ -240,7 +239,7 @@ def springs_vjp(
         rest_length_bar.append(-tension_bar * stiffness * inverse)
 
     def table(rows: list[Float[Array, " HN"]]) -> Float[Array, "D HN"]:
-        return jnp.asarray(rows).reshape(springs.stiffness.shape)  # there may be no row
+        return jnp.asarray(rows).reshape(springs.stiffness.shape)  # also for no row
 
     return dataclasses.replace(
         springs,
@@ -283,8 +282,9 @@ def _difference_together(
 def _subtract(a: Array, b: Array, sign: int) -> Array:
     """`sign * (a - b)`, for a sign of 1 or -1.
 
-    The same difference in several loops is one that XLA computes once, in a loop of its own, and
-    keeps in memory: slower than to take it again. Differences of opposite sign are not the same.
+    If several loops take the same difference, XLA computes it once, in a loop of its own, and
+    keeps it in memory, which is slower than recomputing it. It does not merge differences of
+    opposite sign.
     """
     return a - b if sign > 0 else b - a
 
@@ -294,7 +294,7 @@ def _neighbours(springs: Springs, row: int, values: Float[Array, "N *B"]) -> Flo
 
 
 def _row(springs: Springs, row: int, like: Array) -> list[Array]:
-    """Stiffness, damping and rest length of the springs of one row, to go with a batch."""
+    """Stiffness, damping and rest length of the springs of one row, for a batch."""
     tables = (springs.stiffness, springs.damping, springs.rest_length)
     return [over_batch(table[row], like) for table in tables]
 

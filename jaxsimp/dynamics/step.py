@@ -1,8 +1,7 @@
 """One semi-implicit Euler step of a simulation, and its adjoint.
 
-The step is written for XLA's CPU compiler, which fuses what is cheap into each of its uses:
-axis by axis, every result that is used more than once ending in a division, which XLA holds too
-dear to repeat.
+The code suits XLA's CPU compiler, which recomputes cheap expressions in each of their uses: it goes
+axis by axis, and every result with more than one use ends in a division, which XLA does not repeat.
 """
 
 import dataclasses
@@ -25,21 +24,21 @@ from jaxsimp.dynamics.springs import (
 )
 
 Axes = list[Float[Array, "N *B"]]
-"""Something of every particle along x, y and z."""
+"""Values of every particle along x, y and z."""
 
 Packed = tuple[Float[Array, "3 NHH *B"], Float[Array, "3 NHH *B"]]
-"""Positions and velocities as springs.py wants them: axis first, with halo, batch last."""
+"""Positions and velocities in the layout of springs.py: axis first, with halo, batch last."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["held", "drive"], meta_fields=[])
 @dataclass(frozen=True)
 class Motion:
-    """What pickers do to the particles during an action.
+    """Effect of pickers on the particles during an action.
 
     Attributes:
-        held: which are held, shape (N, *B).
-        drive: their displacement over the time step, shape (3, N, *B), metres per second; zero
-            where nothing is held.
+        held: whether each particle is held, shape (N, *B).
+        drive: displacement of each held particle over the time step, zero elsewhere, shape
+            (3, N, *B), metres per second.
     """
 
     held: Bool[Array, "N *B"]
@@ -47,23 +46,23 @@ class Motion:
 
 
 def step(simulation: Simulation, packed: Packed, motion: Motion, share: Float[Array, ""]) -> Packed:
-    """Forces, velocities, contact, then positions; held particles move by a share of `drive`."""
+    """Forces, velocities, contact, then positions; held particles move by `share` of `drive`."""
     return step_and_free(simulation, packed, motion, share)[0]
 
 
 def step_and_free(
     simulation: Simulation, packed: Packed, motion: Motion, share: Float[Array, ""]
 ) -> tuple[Packed, Axes]:
-    """The state after a step, and the velocities that it would have without contact."""
+    """The state after a step, and the velocities without contact."""
     position, velocity = packed
     tensions = spring_tensions(simulation.springs, position, velocity)
     forces = pull(simulation.springs, tensions, position)
     speed, height = _here(simulation, packed)
     free = _free(simulation, motion, forces, speed)
     moved = _constrained(simulation, motion.held, list(motion.drive), share, free, height)
-    # Velocities are written in place, row by row: a stack of rows would not be vectorised. Then
-    # all positions move, the halo by zero. (To write positions in place, too, costs a fifth of
-    # the step: they are also what is read.)
+    # Write velocities in place, row by row: XLA does not vectorise a stack of rows. Then all
+    # positions move, the halo by zero. (Writing positions in place, too, costs a fifth of the
+    # step, as the step also reads them.)
     velocity = _write_rows(simulation, velocity, moved)
     return (position + simulation.time_step * velocity, velocity), free
 
@@ -77,16 +76,16 @@ def step_vjp(
     packed_bar: tuple[Axes, Axes],
     of_simulation: bool,
 ) -> tuple[Simulation | None, tuple[Axes, Axes], Axes]:
-    """Cotangents of the simulation, state and drive for those of the state after a step.
+    """Cotangents of the simulation, state and drive from those of the state after a step.
 
     Args:
         simulation: the body's physics.
-        packed: the state before the step.
-        free: the velocities without contact, see `step_and_free`.
-        motion: what the pickers do.
-        share: of `motion.drive`.
+        packed: state before the step.
+        free: velocities without contact, see `step_and_free`.
+        motion: effect of the pickers.
+        share: fraction of `motion.drive` in this step.
         packed_bar: cotangents of the state after the step, without halo.
-        of_simulation: whether cotangents of the simulation are wanted; if so, without a batch.
+        of_simulation: whether to compute cotangents of the simulation; if so, without a batch.
     """
     dt, springs = simulation.time_step, simulation.springs
     tensions = spring_tensions(springs, *packed)
@@ -105,11 +104,11 @@ def step_vjp(
     speed, height = _here(simulation, packed)
     moved, pullback = jax.vjp(constrained, physics, list(motion.drive), free, height)
     physics_bar, drive_bar, free_bar, height_bar = pullback(moved_bar)
-    # Linear in forces: what they are matters to cotangents of the physics alone.
+    # The step is linear in forces: their values matter only to cotangents of the physics.
     forces = pull(springs, tensions, packed[0]) if of_simulation else speed
     _, pullback = jax.vjp(unconstrained, physics, forces, speed)
     more_bar, forces_bar, speed_bar = pullback(free_bar)
-    # Any halo will do: the springs into it have no stiffness.
+    # The values in the halo do not matter: the springs into it have no stiffness.
     force_bar = _write_rows(simulation, packed[0], forces_bar)
     by_position, by_velocity = spring_forces_vjp(springs, tensions, *packed, force_bar)
     by_position[2] += height_bar
@@ -118,7 +117,7 @@ def step_vjp(
         physics_bar = jax.tree.map(jnp.add, physics_bar, more_bar)
         physics_bar["time_step"] += sum(map(jnp.vdot, position_bar, moved))
         springs_bar = springs_vjp(springs, tensions, *packed, force_bar)
-        rest_bar = jnp.zeros_like(simulation.rest)  # Only pickers look at it.
+        rest_bar = jnp.zeros_like(simulation.rest)  # Only pickers use it.
         simulation_bar = Simulation(springs=springs_bar, rest=rest_bar, **physics_bar)
     packed_bar = (
         [a + b for a, b in zip(position_bar, by_position, strict=True)],
@@ -130,8 +129,8 @@ def step_vjp(
 def _free(simulation: Simulation, motion: Motion, forces: Axes, velocity: Axes) -> Axes:
     """Velocities after forces, particle by particle."""
     dt = simulation.time_step
-    # Held particles are not free: any mass will do. (With a batch, it makes the mass an array as
-    # large as the batch; a division by anything smaller becomes a product with its inverse.)
+    # The mass of held particles does not matter. (With a batch, `where` makes the mass an array as
+    # large as the batch; XLA turns a division by a smaller array into a product with its inverse.)
     mass = jnp.where(motion.held, 1.0, over_batch(simulation.mass, forces[0]))
     kept = 1.0 - dt * simulation.drag
     gravity = (0.0, 0.0, simulation.gravity)
@@ -158,7 +157,7 @@ def _constrained(
 def _write_rows(
     simulation: Simulation, array: Float[Array, "3 NHH *B"], rows: Axes
 ) -> Float[Array, "3 NHH *B"]:
-    """The array with these rows, but for its halo."""
+    """The array with these rows, and its old halo."""
     for axis, row in enumerate(rows):
         corner = (axis, simulation.springs.halo) + (0,) * (row.ndim - 1)
         array = jax.lax.dynamic_update_slice(array, row[None], corner)
@@ -173,13 +172,13 @@ def _here(simulation: Simulation, packed: Packed) -> tuple[Axes, Float[Array, "N
 
 
 def pack(simulation: Simulation, state: State) -> Packed:
-    """A state as the steps want it."""
+    """A state in the layout of the steps."""
     halo = ((0, 0), (simulation.springs.halo,) * 2)
     return jnp.pad(state.position.T, halo), jnp.pad(state.velocity.T, halo)
 
 
 def unpack(simulation: Simulation, packed: Packed) -> State:
-    """A state as users want it."""
+    """A state in the layout of `State`, particles first."""
     halo, count = simulation.springs.halo, len(simulation.mass)
     position, velocity = (array[:, halo : halo + count].T for array in packed)
     return State(position, velocity)

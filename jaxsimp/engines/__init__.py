@@ -1,4 +1,4 @@
-"""Engines: what carries out plans. Our springs, ensembles of them, MJX, and MuJoCo."""
+"""Engines carry out plans: our mass-springs, ensembles of them, MJX, and MuJoCo."""
 
 from jaxsimp.engines.engine import (
     Engine,

@@ -1,6 +1,7 @@
-"""Engines: what carries out plans. The seam between planning and physics.
+"""Protocols of engines: the interface between planning and physics.
 
-Any engine evaluates plans. Those in JAX can also search: their rollouts are pure functions.
+Any engine evaluates plans. A planner can search in those written in JAX: their rollouts are pure
+functions.
 """
 
 from collections.abc import Callable
@@ -17,9 +18,9 @@ from jaxsimp.tasks import Episode, Task
 
 
 class ExecutionStatus(IntEnum):
-    """What became of a plan.
+    """Outcome of an execution.
 
-    `WARNED`: it was carried out, and the engine warned of something, as contacts left out.
+    `WARNED`: the plan ran to its end, and the engine warned, for example of contacts left out.
     `UNSTABLE`: a number of the simulation was not finite or too large; the plan ends there.
     """
 
@@ -30,15 +31,16 @@ class ExecutionStatus(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """What a plan does in an engine.
+    """Result of carrying out a plan in an engine.
 
     Attributes:
-        positions: at the start, after each action, and settled, shape (T + 2, N, 3), metres; not
-            a number after the simulation became unstable.
-        score: normalised score of the settled state, not a number where it is unstable.
-        status: what became of the plan.
-        warnings: of the engine, by name.
-        missed: contacts whose particles got past each other; None where they are not counted.
+        positions: positions at the start, after each action, and settled, shape (T + 2, N, 3),
+            metres; NaN after the simulation became unstable.
+        score: normalised score of the settled state; NaN if the simulation became unstable.
+        status: outcome of the execution.
+        warnings: names of the engine's warnings.
+        missed: number of tunnelled contacts, whose particles passed through each other; None if
+            the engine does not count them.
     """
 
     positions: Float[np.ndarray, "T2 N 3"]
@@ -54,10 +56,10 @@ Executor = Callable[[Episode, Actions], Execution]
 
 @runtime_checkable
 class Engine(Protocol):
-    """What evaluates plans."""
+    """Evaluates plans."""
 
     def executor(self, task: Task) -> Executor:
-        """What carries out plans of a task; to be made once and called often.
+        """An executor of plans of a task; make it once and call it often.
 
         Raises:
             ValueError: if the engine cannot carry out plans of this task.
@@ -66,15 +68,15 @@ class Engine(Protocol):
 
 
 Observe = Callable[[State, Actions], PyTree[Any]]
-"""Of the state at the end of an action, and that action; pure JAX."""
+"""Observation of the state at the end of an action, and of that action; pure JAX."""
 
 
 @runtime_checkable
 class SearchEngine(Engine, Protocol):
-    """An engine in JAX: one that a search can plan in. It is hashable, as a frozen dataclass."""
+    """An engine written in JAX, in which a planner can search. Hashable: a frozen dataclass."""
 
     def physics(self, task: Task) -> PyTree[Any]:
-        """What all rollouts of a task share: a pytree of arrays.
+        """Arrays that all rollouts of a task share, as a pytree.
 
         Raises:
             ValueError: if the engine cannot carry out plans of this task.
@@ -87,10 +89,10 @@ class SearchEngine(Engine, Protocol):
         """Carry out a plan; pure JAX, to which `jit` and `vmap` apply.
 
         Args:
-            physics: made by `physics`.
-            state: at the start, shapes (N, 3).
-            actions: shapes (T, G) and (T, G, 3).
-            observe: applied at the end of each action.
+            physics: result of `physics`.
+            state: state at the start, shapes (N, 3).
+            actions: the plan, shapes (T, G) and (T, G, 3).
+            observe: function applied at the end of each action.
 
         Returns:
             The state at the end of the last action, and the observations stacked along an axis
@@ -99,11 +101,11 @@ class SearchEngine(Engine, Protocol):
         ...
 
     def risk(self, costs: Float[Array, "*E"]) -> Float[Array, ""]:
-        """One cost of a plan, from its cost or from its costs in each of E physics."""
+        """Cost of a plan, from its single cost or from its costs in each of E physics."""
         ...
 
     def chunk_size(self, physics: PyTree[Any]) -> int:
-        """Rollouts that run fastest under one `vmap` on a core of a CPU."""
+        """Fastest number of rollouts under one `vmap` on a core of a CPU."""
         ...
 
 

@@ -1,8 +1,8 @@
-"""Ensembles: the same body under several physics, so that a plan is evaluated in all of them.
+"""Ensembles: the same body under several physics, each of which evaluates every plan.
 
-A plan found in one simulation may owe its cost to that simulation's numbers. Here a plan's cost is
-taken over members whose stiffness, damping, drag, friction, mass and time step are the body's own
-times factors; see Mordatch, Lowrey and Todorov, "Ensemble-CIO", IROS 2015.
+A plan found in one simulation may owe its cost to that simulation's parameters. An ensemble takes
+the cost of a plan over members whose stiffness, damping, drag, friction, mass and time step are
+the body's own times factors; see Mordatch, Lowrey and Todorov, "Ensemble-CIO", IROS 2015.
 """
 
 import dataclasses
@@ -21,23 +21,23 @@ from jaxsimp.engines.springs import MassSprings, Physics, spring_chunk_size
 from jaxsimp.tasks import Task
 
 MOST_REFINEMENT = 4.0
-"""A spread that needs a time step shorter than the task's by more than this is refused."""
+"""Largest ratio of the task's time step to the ensemble's; a spread that needs more is an error."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How far the members' physics is from the body's own.
+    """Range of the members' physics around the body's own.
 
     Each number is the largest factor, up or down: 1 leaves the quantity as it is.
 
     Attributes:
-        stiffness: of all springs.
-        damping: of all springs.
-        drag: of the air.
-        friction: with the table.
-        mass: of all particles.
-        time_step: of the integration. An action takes as many time steps in every member, so
-            the duration of actions has the same factor: pickers are slower or faster, too.
+        stiffness: factor on the stiffness of all springs.
+        damping: factor on the damping of all springs.
+        drag: factor on air drag.
+        friction: factor on friction with the table.
+        mass: factor on the mass of all particles.
+        time_step: factor on the time step. An action takes the same number of time steps in every
+            member, so its duration has this factor too: pickers are slower or faster.
 
     Raises:
         ValueError: if a number is below 1 or not finite.
@@ -66,11 +66,12 @@ class Ensemble:
     """An engine: one body under E physics; a plan's cost is its risk over them.
 
     Attributes:
-        simulations: stacked: every leaf has a first axis `E`. Member 0 is the body itself.
-        action_steps: time steps of an action, in every member.
-        factors: of each member, by quantity in the order of `QUANTITIES`, shape (E, 6).
-        statistic: the "mean" cost over the members, or that of the "worst".
-        caution: as many standard deviations over the members are added to the mean.
+        simulations: stacked simulations: every leaf has a first axis `E`. Member 0 is the body
+            itself.
+        action_steps: number of time steps of an action, in every member.
+        factors: factors of each member, in the order of `QUANTITIES`, shape (E, 6).
+        statistic: "mean", the mean cost over the members, or "worst", the largest.
+        caution: number of standard deviations over the members that the risk adds to the mean.
 
     Raises:
         ValueError: if the statistic is unknown, or caution is negative, not finite, or given
@@ -96,10 +97,10 @@ class Ensemble:
         return len(self.factors)
 
     def physics(self, task: Task) -> Physics:
-        """The stacked simulations, and pickers that take their number of time steps.
+        """The stacked simulations, and pickers with their number of time steps.
 
         Raises:
-            ValueError: if the ensemble is of a body with another number of particles.
+            ValueError: if the ensemble's body has another number of particles.
         """
         found = self.simulations.mass.shape[1]
         if found != task.body.num_particles:
@@ -114,8 +115,8 @@ class Ensemble:
     ) -> tuple[State, PyTree[Any]]:
         """Carry out a plan in every member: states and observations have a first axis `E`.
 
-        A loop, not one more axis of a batch: under `vmap` over plans all of a batch share the
-        simulation, and their time steps run with the batch last; see batching.py.
+        The members run in a loop, not along a batch axis: under `vmap` over plans the whole batch
+        shares one simulation, and its time steps run with the batch axis last; see batching.py.
         """
         simulations, pickers = physics
 
@@ -125,7 +126,7 @@ class Ensemble:
         return jax.lax.map(one, simulations)
 
     def risk(self, costs: Float[Array, " E"]) -> Float[Array, ""]:
-        """Cost of a plan from those in the members: infinite if one of them is not finite."""
+        """Cost of a plan from its costs in the members: infinite if one of them is not finite."""
         failed = ~jnp.isfinite(costs).all()
         costs = jnp.where(failed, 0.0, costs)
         if self.statistic == "worst":
@@ -135,11 +136,11 @@ class Ensemble:
         return jnp.where(failed, jnp.inf, cost)
 
     def chunk_size(self, physics: Physics) -> int:
-        """As of its members."""
+        """The chunk size of the members."""
         return spring_chunk_size(_member_of(physics, 0)[0])
 
     def executor(self, task: Task) -> Executor:
-        """Carries out plans in member 0, the body itself."""
+        """An executor of plans in member 0, the body itself."""
         alone = MassSprings(self.simulations.self_contact is not None)
         return RolloutExecutor(task, alone, _member_of(self.physics(task), 0))
 
@@ -161,23 +162,23 @@ def make_ensemble(
 ) -> Ensemble:
     """An ensemble of a task's body.
 
-    The logarithms of the factors fill the spread evenly: in each quantity every one of
-    `size - 1` equal parts of it has one member (a Latin hypercube). The time step of member 0 is
-    the task's, or as much shorter as it takes for all members to be stable (nine tenths of the
-    largest stable one, as for a task); actions keep their duration but for `spread.time_step`.
+    The logarithms of the factors are a Latin hypercube: for each quantity, each of `size - 1`
+    equal parts of the spread holds one member. The time step of member 0 is the task's, or the
+    shorter one at which all members are stable (nine tenths of the largest stable one, as for a
+    task); the duration of actions changes only by `spread.time_step`.
 
     Args:
-        task: whose body it is.
+        task: the task.
         size: number of members, `E`.
-        seed: of the factors.
-        spread: of the factors.
+        seed: seed of the factors.
+        spread: range of the factors.
         self_contact: whether the body touches itself, in every member.
         statistic: see `Ensemble`.
         caution: see `Ensemble`.
 
     Raises:
-        ValueError: if the size is below 1, or members so different are stable only at a time
-            step below the task's by more than `MOST_REFINEMENT`; see also `Ensemble`, and
+        ValueError: if the size is below 1, or the members are stable only at a time step that is
+            shorter than the task's by a factor above `MOST_REFINEMENT`; see also `Ensemble`, and
             `Task.simulation` for self-contact.
     """
     if size < 1:
@@ -219,7 +220,7 @@ def draw_factors(size: int, seed: int, spread: Spread) -> Float[np.ndarray, "E Q
 
 
 def _scaled_task(task: Task, factors: dict[str, float]) -> Task:
-    """The task with a body of other physics; its longest time step has the factor, too."""
+    """The task with scaled physics of its body, and its longest time step scaled too."""
     return dataclasses.replace(
         task,
         body=task.body.scaled(**{k: v for k, v in factors.items() if k != "time_step"}),

@@ -1,9 +1,9 @@
-"""How a population of rollouts is laid on this machine: the one place that decides it.
+"""Layout of a population of rollouts on the cores and devices of this machine.
 
-On a CPU it is fastest to give every core its share of the population, and to run that share in
-chunks small enough for their state to stay in the cache, each through its whole rollout (under
-`vmap`, time steps run with the batch as last axis, see batching.py). On a GPU the whole population
-in one `vmap` is. See `Layout`.
+On a CPU the fastest layout gives every core an equal part of the population, and runs that part in
+chunks whose state fits in the cache, each through its whole rollout (under `vmap`, time steps run
+with the batch axis last, see batching.py). On a GPU the fastest is the whole population in one
+`vmap`. See `Layout`.
 """
 
 import time
@@ -23,12 +23,12 @@ from jaxsimp.machine import num_cores
 
 @dataclass(frozen=True)
 class Layout:
-    """A population split into one share a worker, each run in chunks of samples.
+    """A population split into one part per worker, each run in chunks of samples.
 
     Attributes:
-        chunk_size: samples batched by `vmap`, or 1 for none; the chunks of a share run one after
-            another.
-        num_workers: host threads that run a share each; they take the devices in turn.
+        chunk_size: number of samples batched by `vmap`, 1 for no batching; a worker runs its
+            chunks one after another.
+        num_workers: number of host threads, each with its part; they take the devices in turn.
 
     Raises:
         ValueError: if a number is below 1.
@@ -46,14 +46,14 @@ class Layout:
 
 
 def default_layout(population: int, chunk_size: int) -> Layout:
-    """The layout measured to be fastest for a population of rollouts.
+    """The layout that was fastest in measurements, for a population of rollouts.
 
-    On a CPU every core takes a share, in chunks; on anything else every device takes a share in
-    one `vmap`.
+    On a CPU every core takes an equal part, in chunks; on other devices every device takes an
+    equal part in one `vmap`.
 
     Args:
-        population: rollouts at a time.
-        chunk_size: rollouts that run fastest under one `vmap` on a core of a CPU, see
+        population: number of rollouts at a time.
+        chunk_size: fastest number of rollouts under one `vmap` on a core of a CPU, see
             `SearchEngine.chunk_size`.
     """
     devices = jax.local_devices()
@@ -67,13 +67,13 @@ def default_layout(population: int, chunk_size: int) -> Layout:
 class PopulationMap:
     """A function of one sample, compiled for a population of fixed size and layout.
 
-    The function is compiled for one share, so every sample runs through the same machine
-    code on whatever worker: results do not depend on how many there are.
+    Compilation is for one worker's part, so every sample runs through the same machine code on
+    every worker: results do not depend on the number of workers.
 
     Attributes:
-        compile_seconds: that compilation took.
-        temporary_bytes: that the compiled function sets aside while a worker runs it; 0 where
-            the backend does not say.
+        compile_seconds: compilation time, seconds.
+        temporary_bytes: temporary memory of the compiled function in one worker, bytes; 0 if the
+            backend does not report it.
     """
 
     def __init__(
@@ -86,10 +86,10 @@ class PopulationMap:
         """Compile.
 
         Args:
-            sample_fn: of `shared` and one sample; pure JAX.
-            shared: arguments common to all samples, as an example.
-            batch: a whole population, leading axis `B` on every leaf, as an example.
-            layout: how it is laid on the machine.
+            sample_fn: function of `shared` and one sample; pure JAX.
+            shared: example of the arguments common to all samples.
+            batch: example of a whole population, leading axis `B` on every leaf.
+            layout: layout of the population on the machine.
         """
         population = len(jax.tree.leaves(batch)[0])
         self._layout, self._population = layout, population
@@ -97,12 +97,13 @@ class PopulationMap:
         devices = jax.local_devices()
         self._devices = [devices[w % len(devices)] for w in range(layout.num_workers)]
         self._pool = ThreadPoolExecutor(layout.num_workers)
-        # `jax.enable_x64` as a context holds for one thread: the workers are told.
+        # `jax.enable_x64` as a context holds for one thread only, so pass it on to the workers.
         self._x64 = jnp.result_type(float) == jnp.float64
 
         trees = jax.tree.structure(shared), jax.tree.structure(batch)
 
-        # Of leaves: what is compiled would otherwise make trees of things that are no arrays.
+        # Compile a function of leaves: JAX would otherwise build trees of objects that are not
+        # arrays.
         def share_fn(shared: list[Array], share: list[Array]) -> PyTree[Any]:
             shared = jax.tree.unflatten(trees[0], shared)
 
@@ -113,7 +114,7 @@ class PopulationMap:
                 return jax.lax.map(one, share)
             return jax.lax.map(one, share, batch_size=layout.chunk_size)
 
-        # Full-width vectors: worth 1.2 to 1.4 times the speed where the processor has them.
+        # Full-width vectors: 1.2 to 1.4 times as fast on processors that have them.
         options = {"xla_cpu_prefer_vector_width": 512} if devices[0].platform == "cpu" else None
         jitted = jax.jit(share_fn, compiler_options=options)
         start = time.perf_counter()
@@ -130,7 +131,7 @@ class PopulationMap:
         """The function's values on a population, leading axis `B`, on the host.
 
         Raises:
-            ValueError: if there are more samples than were compiled for.
+            ValueError: if the batch has more samples than the example had.
         """
         population = len(jax.tree.leaves(batch)[0])
         if population > self._population:
@@ -149,7 +150,7 @@ class PopulationMap:
             return jax.device_get(self._compiled[device](*jax.device_put((shared, share), device)))
 
     def _shares(self, batch: PyTree[Any]) -> list[list[np.ndarray]]:
-        """Leaves of equal shares, the last ones filled up with copies of the last sample."""
+        """Leaves of equal parts, the last ones padded with copies of the last sample."""
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(batch)]
         wanted = np.arange(self._share * self._layout.num_workers)
         wanted = np.minimum(wanted, len(leaves[0]) - 1)

@@ -1,4 +1,4 @@
-"""What engines in JAX share: the cost of a plan, and its execution."""
+"""Cost and execution of a plan, for all engines in JAX."""
 
 from functools import cached_property, partial
 from typing import Any
@@ -17,10 +17,10 @@ from jaxsimp.tasks import Episode, Task, score
 def plan_cost(
     task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
 ) -> Float[Array, ""]:
-    """Cost of a plan: the running costs of its actions and the terminal cost, added up.
+    """Cost of a plan: the sum of the running costs of its actions and the terminal cost.
 
-    The terminal cost is of the state that is left an action's time after the pickers have let go.
-    The paper adds up the same cost over all steps (section IV-A).
+    The terminal cost is that of the state one action's duration after the pickers have let go.
+    The paper sums the same cost over all steps (section IV-A).
     """
     terminal_cost: object = task.terminal_cost
     is_one_cost = task.running_cost is terminal_cost  # which is then taken once
@@ -40,39 +40,39 @@ def plan_cost(
 def settled_score(
     task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
 ) -> Float[Array, ""]:
-    """Score of the state that a plan settles in."""
+    """Score of the settled state after a plan."""
     followed = then_idle(actions, task.settle_actions)
     final, _ = engine.rollout(physics, at_rest(episode.start), followed, lambda *_: ())
     return score(task, episode, final.position)
 
 
 class RolloutExecutor:
-    """Plans of a task, carried out by the rollouts of an engine of one physics.
+    """Executor of a task's plans by the rollouts of an engine with one physics.
 
     Attributes:
-        compile_seconds: that compilation took, 0 before the first plan.
+        compile_seconds: compilation time, seconds; 0 before the first plan.
     """
 
     def __init__(self, task: Task, engine: SearchEngine, physics: PyTree[Any]) -> None:
-        """Nothing is compiled before the first plan.
+        """Make an executor; compilation waits for the first plan.
 
         Args:
-            task: what is asked.
-            engine: whose rollouts carry plans out; it observes no axis of an ensemble.
-            physics: that the rollouts are in.
+            task: the task.
+            engine: engine of the rollouts; its observations have no axis of an ensemble.
+            physics: physics of the rollouts.
         """
         self._task, self._engine, self._physics = task, engine, physics
 
     @property
     def compile_seconds(self) -> float:
-        """Seconds that compilation took."""
+        """Compilation time, seconds."""
         return self._compiled.compile_seconds
 
     def __call__(self, episode: Episode, actions: Actions) -> Execution:
         """Carry out a plan, let the body settle, and score it.
 
         Raises:
-            ValueError: if the plan has not as many actions and pickers as the task.
+            ValueError: if the numbers of actions and pickers are not those of the task.
         """
         wanted = self._task.num_actions, self._task.num_pickers
         if actions.pick.shape != wanted:
@@ -100,7 +100,7 @@ class RolloutExecutor:
 def _execute(
     task: Task, engine: SearchEngine, shared: tuple[PyTree[Any], Episode], actions: Actions
 ) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""], Int[Array, ""] | None]:
-    """Positions at the start, after each action and settled, score of the last, and `missed`."""
+    """Positions at the start, after each action and settled; score of the last; and `missed`."""
     physics, episode = shared
     start = at_rest(episode.start)
     followed = then_idle(actions, task.settle_actions)
@@ -111,6 +111,6 @@ def _execute(
 
 
 def as_float(tree: PyTree[Any]) -> PyTree[np.ndarray]:
-    """Arrays on the host, in the floating point numbers that JAX works with now."""
+    """Arrays on the host, in JAX's current floating point precision."""
     dtype = np.dtype(jnp.result_type(float))
     return jax.tree.map(lambda array: np.asarray(array, dtype), tree)

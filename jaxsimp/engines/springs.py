@@ -1,4 +1,4 @@
-"""Our own mass-springs as an engine."""
+"""Our mass-spring dynamics as an engine."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,17 +11,17 @@ from jaxsimp.engines.rollouts import RolloutExecutor
 from jaxsimp.tasks import Task
 
 CHUNK_SIZE = 8
-"""Samples a chunk on a CPU, whatever the number of workers: a sample's chunk decides how it rounds,
-so plans do not depend on how many cores or devices there are. Larger chunks are within a fifth."""
+"""Samples per chunk on a CPU, for any number of workers: the chunk size determines rounding, so
+plans do not depend on the number of cores or devices. The speed of larger chunks is within 20 %."""
 MOST_CHUNKED_PARTICLES = 1000
-"""Grids and ropes of more run sample by sample: the states of a chunk would leave the cache."""
+"""Larger grids and ropes run sample by sample: the states of a chunk would not fit in the cache."""
 
 Physics = tuple[Simulation, Pickers]
 
 
 @dataclass(frozen=True)
 class MassSprings:
-    """Our own dynamics, the engine of a planner by default.
+    """Our own dynamics, the default engine of a planner.
 
     Attributes:
         self_contact: whether the body touches itself, or passes through itself.
@@ -53,7 +53,7 @@ class MassSprings:
 
 
 def spring_chunk_size(simulation: Simulation) -> int:
-    """Rollouts of mass-springs that run fastest under one `vmap` on a core."""
+    """Fastest number of mass-spring rollouts under one `vmap` on a core."""
     large = simulation.springs.offsets and len(simulation.mass) > MOST_CHUNKED_PARTICLES
-    # Only a sample by itself looks its contacts up no more often than it must.
+    # A batch would search for contacts more often than each of its samples needs.
     return 1 if large or simulation.self_contact is not None else CHUNK_SIZE

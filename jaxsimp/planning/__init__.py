@@ -1,4 +1,4 @@
-"""Planning: a task and the particles that may be grasped become a plan.
+"""Planning: from a task and candidates, the particles that a picker may grasp, to a plan.
 
 A *problem* gives the cost of plans; an *algorithm*, one file each, asks for costs and is told them;
 `optimize` and `Planner` run algorithms on problems.

@@ -1,4 +1,4 @@
-"""Algorithms: what a planner needs to know of a method of search. One file each.
+"""Algorithms: the protocol of search methods. One file each.
 
 An algorithm asks for the costs of plans and is told them. It knows the space of plans and their
 costs, and nothing of bodies, tasks or physics. Two drivers run it: `optimize`, a pure loop, and
@@ -17,22 +17,22 @@ from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 
 Wants = Literal["cost", "gradient", "settled"]
-"""What an algorithm is told of a plan: its cost; the cost and its gradient; or 1 minus the score
-of the settled state, in the physics that scores."""
+"""Kind of evaluation that an algorithm asks for: the cost of a plan; the cost and its gradient; or
+1 minus the score of the settled state, in the evaluator's physics."""
 
 PRICES: dict[Wants, int] = {"cost": 1, "gradient": 6, "settled": 4}
-"""Price of a plan by what is wanted of it, in rollouts. Measured without self-contact on a CPU: a
-gradient takes 4.7 to 6 rollouts, a rollout with self-contact about 4."""
+"""Price of one evaluation by its kind, in rollouts. Measured without self-contact on a CPU: a
+gradient takes the time of 4.7 to 6 rollouts, a rollout with self-contact that of about 4."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["costs", "gradients"], meta_fields=[])
 @dataclass(frozen=True)
 class Told:
-    """What an algorithm is told of the plans that it asked for.
+    """Evaluations of the plans that an algorithm asked for.
 
     Attributes:
-        costs: infinite where a rollout was not finite, shape (B,).
-        gradients: of the costs by `Plans.direction`, zero where one is not finite, shape
+        costs: costs of the plans, infinite if a rollout was not finite, shape (B,).
+        gradients: gradients of the costs by `Plans.direction`, zero if one is not finite, shape
             (B, T, G, 3); None unless the algorithm wants them.
     """
 
@@ -48,27 +48,27 @@ class Algorithm(Protocol):
     """
 
     def __hash__(self) -> int:
-        """Of the settings: what is compiled for an algorithm is kept."""
+        """Hash of the settings, the key of compiled functions that are kept."""
         ...
 
     @property
     def num_asks(self) -> int:
-        """How often it asks."""
+        """Number of questions, each about `num_plans` plans."""
         ...
 
     @property
     def num_plans(self) -> int:
-        """Plans that it asks for at a time, `B`."""
+        """Number of plans in a question, `B`."""
         ...
 
     @property
     def num_starts(self) -> int:
-        """Archived plans that it starts from, at most; 0 if it starts from none."""
+        """Largest number of archived plans that it starts from; 0 for none."""
         ...
 
     @property
     def wants(self) -> Wants:
-        """What it is told of a plan."""
+        """Kind of evaluation that it asks for."""
         ...
 
     def init(self, space: ActionSpace, archive: Archive) -> PyTree[Any]:
@@ -95,13 +95,13 @@ class Algorithm(Protocol):
 
 
 class Defaults:
-    """What most algorithms answer: costs are wanted, the best plan is returned."""
+    """Defaults of most algorithms: they want costs, and return the best plan."""
 
     num_starts: int = 0
     wants: Wants = "cost"
 
     def answer(self, space: ActionSpace, state: PyTree[Any]) -> Plans | None:
-        """The best of the archive."""
+        """None, for the best plan of the archive."""
         return None
 
     def trace(self, state: PyTree[Any]) -> dict[str, Array]:
@@ -114,10 +114,10 @@ class Sequence:
     """Algorithms that follow one another: each starts from the best plans of those before.
 
     Attributes:
-        algorithms: in their order, at least one.
+        algorithms: the algorithms in order, at least one.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: if there is no algorithm.
     """
 
     algorithms: tuple[Algorithm, ...]
@@ -128,7 +128,7 @@ class Sequence:
 
 
 def stages(algorithm: Algorithm | Sequence) -> tuple[Algorithm, ...]:
-    """The algorithms of a sequence, or the one that is given."""
+    """The algorithms of a sequence, or the single algorithm given."""
     return algorithm.algorithms if isinstance(algorithm, Sequence) else (algorithm,)
 
 

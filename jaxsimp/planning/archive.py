@@ -1,4 +1,4 @@
-"""The best distinct plans so far: what warms one algorithm with the results of another."""
+"""The archive of the best distinct plans so far, from which the next algorithm starts."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -11,8 +11,8 @@ from jaxtyping import Array, Bool, Float
 from jaxsimp.planning.space import ActionSpace, Plans
 
 DISTINCT = 0.05
-"""Plans that grasp the same are one plan if no displacement differs by more, in units of the
-limits: about 10 mm in a task of cloth."""
+"""Largest difference of displacements, in units of the limits, at which two plans with the same
+choices count as one plan: about 10 mm in a task of cloth."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["plans", "costs", "filled"], meta_fields=[])
@@ -21,9 +21,9 @@ class Archive:
     """The best distinct plans so far, best first.
 
     Attributes:
-        plans: shapes (M, T, G) and (M, T, G, 3).
-        costs: of the plans, infinite for rollouts that were not finite, shape (M,).
-        filled: True where there is a plan, shape (M,).
+        plans: the plans, shapes (M, T, G) and (M, T, G, 3).
+        costs: costs of the plans, infinite for rollouts that were not finite, shape (M,).
+        filled: True in rows that hold a plan, shape (M,).
     """
 
     plans: Plans
@@ -31,7 +31,7 @@ class Archive:
     filled: Bool[Array, "*E M"]
 
     def best(self, count: int) -> Plans:
-        """The best plans, copies of the best where there are fewer."""
+        """The best plans, padded with copies of the best if there are fewer."""
         index = jnp.where(self.filled, jnp.arange(len(self.filled)), 0)[:count]
         return jax.tree.map(lambda leaf: leaf[index], self.plans)
 
@@ -46,11 +46,11 @@ def empty_archive(space: ActionSpace, size: int) -> Archive:
 def archived(
     archive: Archive, space: ActionSpace, plans: Plans, costs: Float[Array | np.ndarray, " B"]
 ) -> Archive:
-    """The archive with the best distinct of its own and of further plans; the older win ties."""
+    """The archive of the best distinct plans of its own and of new ones; the older win ties."""
     plans = jax.tree.map(lambda *parts: jnp.concatenate(parts), archive.plans, plans)
     costs = jnp.concatenate([archive.costs, costs.astype(archive.costs.dtype)])
     free = jnp.concatenate([archive.filled, jnp.ones(len(costs) - len(archive.costs), bool)])
-    # A plan that failed still comes before no plan.
+    # A failed plan still ranks before an empty row.
     worst = jnp.finfo(costs.dtype).max
     chosen, filled = [], []
     for _ in range(len(archive.costs)):
@@ -63,7 +63,7 @@ def archived(
 
 
 def _alike(space: ActionSpace, plans: Plans, one: Array) -> Bool[Array, " B"]:
-    """Which plans are the same as one of them."""
+    """Whether each plan counts as the same as plan `one`."""
     same = (plans.choice == plans.choice[one][None]).all(axis=(1, 2))
     moves = jnp.abs(plans.direction - plans.direction[one][None]).max(axis=-1)
     grasped = plans.choice < len(space.candidates)

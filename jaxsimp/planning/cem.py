@@ -26,15 +26,15 @@ from jaxsimp.planning.space import ActionSpace, Plans
 )
 @dataclass(frozen=True)
 class CEMState:
-    """Where a search is.
+    """State of a search by the cross-entropy method.
 
     Attributes:
-        distribution: that samples are drawn from.
-        asked: the samples of the last question, leading axis `B`.
-        elites: the best samples of this round so far, best first, leading axis `E`.
-        costs: of the elites, shape (E,).
-        filled: True where there is an elite, shape (E,).
-        count: populations drawn so far.
+        distribution: distribution of the samples.
+        asked: samples of the last question, leading axis `B`.
+        elites: best samples of this round so far, best first, leading axis `E`.
+        costs: costs of the elites, shape (E,).
+        filled: True in rows that hold an elite, shape (E,).
+        count: number of populations drawn so far.
     """
 
     distribution: PyTree[Any]
@@ -50,16 +50,16 @@ class CEM(Defaults):
     """The cross-entropy method.
 
     Attributes:
-        num_iterations: rounds of sampling and fitting.
-        population: plans drawn in each round.
-        initial_populations: as many times `population` plans are drawn in the first round: what
-            the first elites miss, later rounds seldom find again.
-        elite_fraction: fraction of the population that the distribution is fitted to.
-        smoothing: fraction of the old distribution that is kept in each update.
-        initial_spread: deviation of the first displacements, in units of the limits.
-        keep_best: put the best plan so far among the elites of each round.
-        returns: the "best" plan that was drawn, or the "mean" of the last distribution.
-        encoding: of plans as samples of a distribution.
+        num_iterations: number of rounds of sampling and fitting.
+        population: number of plans drawn in each round.
+        initial_populations: number of populations drawn in the first round: later rounds seldom
+            find folds that are absent from the first elites.
+        elite_fraction: fraction of the population that are elites.
+        smoothing: fraction of the old distribution kept in each update.
+        initial_spread: standard deviation of the first displacements, in units of the limits.
+        keep_best: whether the best plan so far joins the elites of each round.
+        returns: "best", the best plan drawn, or "mean", the mean of the last distribution.
+        encoding: encoding of plans as samples of a distribution.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -90,17 +90,17 @@ class CEM(Defaults):
 
     @property
     def num_asks(self) -> int:
-        """Populations drawn in all rounds."""
+        """Number of populations drawn in all rounds."""
         return self.num_iterations + self.initial_populations - 1
 
     @property
     def num_plans(self) -> int:
-        """Plans drawn at a time."""
+        """Number of plans in a population."""
         return self.population
 
     @property
     def num_elites(self) -> int:
-        """Plans that the distribution is fitted to, at least 2 where there are as many."""
+        """Number of elites, at least 2 unless the population is smaller."""
         return min(self.population, max(2, round(self.elite_fraction * self.population)))
 
     def init(self, space: ActionSpace, archive: Archive) -> CEMState:
@@ -129,7 +129,7 @@ class CEM(Defaults):
 
     def tell(self, space: ActionSpace, state: CEMState, plans: Plans, told: Told) -> CEMState:
         """Choose the elites; fit the distribution to them at the end of a round."""
-        begins = state.count >= self.initial_populations  # the elites are those of a round before
+        begins = state.count >= self.initial_populations  # the elites are from an earlier round
         kept = jnp.arange(self.num_elites) < (1 if self.keep_best else 0)
         filled = state.filled & (kept | ~begins)
         elites, costs, filled = _best(
@@ -148,7 +148,7 @@ class CEM(Defaults):
         return CEMState(distribution, state.asked, elites, costs, filled, count)
 
     def answer(self, space: ActionSpace, state: CEMState) -> Plans | None:
-        """The mean of the last distribution, if that is to be returned."""
+        """The mean of the last distribution if `returns` is "mean", else None."""
         if self.returns == "best":
             return None
         return self.encoding.decode(space, self.encoding.mean(space, state.distribution))
@@ -159,7 +159,7 @@ class CEM(Defaults):
 
 
 Ranked = tuple[PyTree[Any], Float[Array, " _"], Bool[Array, " _"]]
-"""Samples, their costs, and where there are any, as many of each."""
+"""Samples, their costs, and whether each row holds a sample."""
 
 
 def _best(count: int, *pools: Ranked) -> Ranked:

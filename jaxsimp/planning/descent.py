@@ -1,4 +1,4 @@
-"""Gradient descent on displacements, from the best plans of a search; what is grasped stays.
+"""Gradient descent on displacements, from the best plans of a search; choices do not change.
 
 Kingma and Ba, "Adam: a method for stochastic optimization", ICLR 2015, with a learning rate that
 falls to zero as a cosine.
@@ -18,17 +18,17 @@ from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 
 INSIDE = 1 - 1e-4
-"""Largest displacement in units of the limits: at a limit half of the gradient is lost."""
+"""Largest displacement, in units of the limits: at a limit, half of the gradient is lost."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["plans", "moments"], meta_fields=[])
 @dataclass(frozen=True)
 class DescentState:
-    """Where the descent is.
+    """State of the descent.
 
     Attributes:
-        plans: leading axis `num_starts`.
-        moments: of the optimiser.
+        plans: current plans, leading axis `num_starts`.
+        moments: moments of the optimiser.
     """
 
     plans: Plans
@@ -40,9 +40,9 @@ class Descent(Defaults):
     """Adam on the displacements of the best archived plans.
 
     Attributes:
-        num_asks: steps of the descent.
-        num_starts: plans that descend, side by side.
-        learning_rate: the first, in units of the limits.
+        num_asks: number of steps.
+        num_starts: number of plans, optimised side by side.
+        learning_rate: learning rate of the first step, in units of the limits.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -62,18 +62,18 @@ class Descent(Defaults):
 
     @property
     def num_plans(self) -> int:
-        """Plans that descend, side by side."""
+        """Number of plans, optimised side by side."""
         return self.num_starts
 
     def init(self, space: ActionSpace, archive: Archive) -> DescentState:
-        """The best archived plans, copies of the best where there are fewer."""
+        """The best archived plans, padded with copies of the best if there are fewer."""
         plans = archive.best(self.num_starts)
         return DescentState(plans, self._optimizer.init(plans.direction))
 
     def ask(
         self, space: ActionSpace, state: DescentState, key: PRNGKeyArray
     ) -> tuple[DescentState, Plans]:
-        """The plans as they are now."""
+        """The current plans."""
         return state, state.plans
 
     def tell(

@@ -17,15 +17,15 @@ from jaxsimp.planning.space import ActionSpace, Plans
 
 @runtime_checkable
 class Encoding(Protocol):
-    """What CEM needs to know of a distribution over plans."""
+    """A family of distributions over plans, for CEM."""
 
     @property
     def name(self) -> str:
-        """What it is called in `ENCODINGS`."""
+        """Its name in `ENCODINGS`."""
         ...
 
     def init(self, space: ActionSpace, spread: float) -> PyTree[Any]:
-        """The distribution before any sample; `spread` is the deviation of displacements."""
+        """The first distribution; `spread` is the standard deviation of displacements."""
         ...
 
     def sample(
@@ -45,7 +45,7 @@ class Encoding(Protocol):
     def update(
         self, space: ActionSpace, distribution: PyTree[Any], elites: PyTree[Any], smoothing: float
     ) -> PyTree[Any]:
-        """Fit to the elites, keeping the fraction `smoothing` of the distribution before."""
+        """Fit to the elites, keeping the fraction `smoothing` of the old distribution."""
         ...
 
     def mean(self, space: ActionSpace, distribution: PyTree[Any]) -> PyTree[Any]:
@@ -129,9 +129,9 @@ class ChoiceAndGaussian:
     """A categorical distribution of choices beside a Gaussian of displacements.
 
     Attributes:
-        frequency: of each candidate, and of None, shape (T, G, K + 1).
-        displacement: in units of the limits, shape (T, G, 3), or of each choice,
-            (T, G, K + 1, 3).
+        frequency: frequency of each candidate, and of None, shape (T, G, K + 1).
+        displacement: Gaussian of displacements, in units of the limits, shape (T, G, 3), or one
+            for each choice, shape (T, G, K + 1, 3).
     """
 
     frequency: Float[Array, "T G K1"]
@@ -195,16 +195,16 @@ class Categorical(ChoiceAndDirection):
 
 @dataclass(frozen=True)
 class Joint(ChoiceAndDirection):
-    """What is grasped and where it goes, together: a Gaussian for each candidate in each slot.
+    """Joint distribution of choice and displacement: a Gaussian per candidate in each slot.
 
-    A fold of several corners has many orders; under one Gaussian for all candidates of a slot (an
-    action of a picker), as in `Categorical`, a corner that is tried there later inherits the
+    A slot is one action of one picker. A fold of several corners has many orders; with one Gaussian
+    for all candidates of a slot, as in `Categorical`, a corner tried there later inherits the
     displacement of another. Candidates with few elites borrow from all elites of the slot
     (shrinkage: `borrowed` counts as that many elites).
 
-    A search that has settled on some folds no longer tries others, so a fraction `fresh` of the
-    slots is drawn evenly from all choices and displacements, whatever the distribution (a defensive
-    mixture: Hesterberg, "Weighted average importance sampling and defensive mixture
+    A search that has converged on some folds no longer tries others, so a fraction `fresh` of the
+    slots is drawn uniformly from all choices and displacements, whatever the distribution (a
+    defensive mixture: Hesterberg, "Weighted average importance sampling and defensive mixture
     distributions", Technometrics, 1995).
     """
 
@@ -271,7 +271,7 @@ def _draw_choices(
 ) -> Int[Array, "num T G"]:
     """Choices by the inverse of the cumulative distribution.
 
-    One random number a draw, where `jax.random.categorical` takes one a candidate.
+    It takes one random number per draw; `jax.random.categorical` takes one per candidate.
     """
     cumulative = jnp.cumsum(frequency, axis=-1)
     uniform = jax.random.uniform(key, (num, *cumulative.shape[:-1]))
@@ -282,12 +282,12 @@ def _draw_choices(
 def _of_choice(
     values: Float[Array, "T G K1 3"], choice: Int[Array, "num T G"]
 ) -> Float[Array, "num T G 3"]:
-    """The values of what was chosen in each slot."""
+    """The values of the choice in each slot."""
     return jnp.take_along_axis(values[None], choice[..., None, None], axis=-2)[..., 0, :]
 
 
 def _centred(shape: tuple[int, ...], spread: float) -> Gaussian:
-    # With a dtype, or the first update would compile for one type and the next for another.
+    # With a dtype: otherwise the first update compiles for one type and the next for another.
     return Gaussian(jnp.zeros(shape, dtype=float), jnp.full(shape, spread, dtype=float))
 
 

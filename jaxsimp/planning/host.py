@@ -1,7 +1,7 @@
 """The driver on the host: exchanges compiled ahead, evaluations by any function.
 
-Costs may come from anywhere: from `Planner`, which evaluates plans on all cores, from an engine
-that is not in JAX, or from a robot.
+Costs may come from `Planner`, which evaluates plans on all cores, from an engine that is not in
+JAX, or from a robot.
 """
 
 from collections.abc import Callable
@@ -32,14 +32,15 @@ from jaxsimp.planning.loop import (
 from jaxsimp.planning.space import ActionSpace, Plans
 
 QUICK = {"xla_backend_optimization_level": 0}
-"""Random bits compile five times as fast unoptimised, and a round draws them once."""
+"""Compiler options for random bits: they compile five times as fast unoptimised, and a round draws
+them only once."""
 
 
 @dataclass(frozen=True)
 class Exchanges:
     """Compiled functions of one algorithm and one shape of its space.
 
-    Each is the function of loop.py of its name.
+    Each is the function of loop.py with the same name.
     """
 
     begin: Callable[[ActionSpace, Archive, Int[Array, ""]], Progress]
@@ -49,7 +50,7 @@ class Exchanges:
 
 
 Evaluate = Callable[[Wants, Actions], Told]
-"""What is wanted of plans, leading axis `B`."""
+"""Evaluates plans as the algorithm wants, leading axis `B`."""
 
 
 def search_on_host(
@@ -62,11 +63,11 @@ def search_on_host(
     """Search for a plan of low cost: `optimize`, in a loop on the host.
 
     Args:
-        algorithm: that searches, or several that follow one another.
-        space: the plans that may be searched.
-        key: of the random draws.
-        evaluate: what is wanted of plans; costs may be NumPy arrays.
-        on_ask: called after each question of an algorithm.
+        algorithm: algorithm of the search, or a sequence of algorithms.
+        space: space of plans to search.
+        key: key of the random draws.
+        evaluate: function that evaluates plans; costs may be NumPy arrays.
+        on_ask: function called after each question of an algorithm.
     """
 
     def run_stage(
@@ -91,7 +92,7 @@ def search_on_host(
 
 
 def compiled_exchanges(algorithm: Algorithm, space: ActionSpace, archive_size: int) -> Exchanges:
-    """The exchanges of an algorithm, compiled when they are first wanted for these shapes."""
+    """The exchanges of an algorithm, compiled at the first call with these shapes."""
     shapes = len(space.candidates), space.num_actions, space.num_pickers, archive_size
     return _compile(algorithm, *shapes, jnp.result_type(float))
 
@@ -103,7 +104,7 @@ def _compile(
     num_actions: int,
     num_pickers: int,
     archive_size: int,
-    dtype: Any,  # tells caches of different precisions apart
+    dtype: Any,  # separates caches of different precisions
 ) -> Exchanges:
     ids, limits = jnp.zeros(num_candidates, int), jnp.zeros(3, float)
     space = ActionSpace(ids, limits, num_actions, num_pickers)
@@ -124,7 +125,7 @@ def _compiled(
 ) -> Callable[..., Any]:
     """The function, compiled for arguments of these shapes.
 
-    It is compiled of leaves: trees of shapes, and not of arrays, are never made.
+    It takes leaves, so JAX never builds trees of shapes instead of arrays.
     """
     tree, out = jax.tree.structure(arguments), []
 
@@ -139,7 +140,7 @@ def _compiled(
 
 
 def _no_costs(algorithm: Algorithm, actions: Actions) -> Told:
-    """What the algorithm is told of plans, all zero."""
+    """Evaluations of plans as the algorithm wants them, all zero."""
     costs = jnp.zeros(len(actions.pick), float)
     gradients = jnp.zeros_like(actions.displacement) if algorithm.wants == "gradient" else None
     return Told(costs, gradients)

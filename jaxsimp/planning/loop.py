@@ -1,4 +1,4 @@
-"""Optimisation: algorithms run on a problem. One code for two drivers.
+"""Optimisation: algorithms run on a problem. The code that both drivers share.
 
 `optimize` is a pure function, its loop a `lax.scan`: `jit` and `vmap` apply, over keys and over
 episodes. `Planner` runs the same `search`, the exchanges of each stage in a loop on the host.
@@ -26,12 +26,12 @@ from jaxsimp.planning.space import ActionSpace, Plans
 )
 @dataclass(frozen=True)
 class Progress:
-    """How far an algorithm is.
+    """Progress of an algorithm.
 
     Attributes:
-        state: of the algorithm.
-        archive: the best distinct plans so far.
-        failed: plans so far whose cost was not finite.
+        state: state of the algorithm.
+        archive: best distinct plans so far.
+        failed: number of plans so far whose cost was not finite.
     """
 
     state: PyTree[Any]
@@ -46,15 +46,15 @@ class Progress:
 )
 @dataclass(frozen=True)
 class Optimum:
-    """What a search found; `jax.vmap` may add axes before all shapes.
+    """Result of a search; `jax.vmap` may add axes before all shapes.
 
     Attributes:
         actions: the plan, shapes (T, G) and (T, G, 3).
-        cost: of that plan; infinite if no rollout was finite.
-        archive: the best distinct plans, as algorithms see them.
+        cost: cost of that plan; infinite if no rollout was finite.
+        archive: best distinct plans, in units of the limits.
         best_costs: lowest cost so far after each question, shape (asks,).
-        traces: of each algorithm, by name: what `Algorithm.trace` gave after each question.
-        failed: plans whose cost was not finite.
+        traces: results of `Algorithm.trace` after each question, by name, for each algorithm.
+        failed: number of plans whose cost was not finite.
     """
 
     actions: Actions
@@ -70,10 +70,10 @@ Keys = Shaped[Array, "asks *key"]
 RunStage = Callable[
     [Algorithm, Archive, Int[Array, ""], Keys], tuple[Progress, Actions, "Recorded"]
 ]
-"""Runs one algorithm from an archive and a count of failures, an exchange for each key: the
-progress after the last, the actions that it returns, and a record."""
+"""Runs one algorithm from an archive and a count of failures, one exchange per key. It returns the
+progress after the last, the algorithm's plan, and a record."""
 Recorded = tuple[Float[Array | np.ndarray, "*asks"], Mapping[str, Array | np.ndarray]]
-"""Lowest cost so far, and what `Algorithm.trace` gave, after one exchange or after each."""
+"""Lowest cost so far, and the result of `Algorithm.trace`, after one exchange or after each."""
 
 
 def optimize(
@@ -85,13 +85,14 @@ def optimize(
 ) -> Optimum:
     """Search for a plan of low cost; pure, so that `jit` and `vmap` apply.
 
-    A plan whose cost is not finite ranks last and is counted.
+    A plan whose cost is not finite ranks last and counts as failed.
 
     Args:
-        problem: what is minimised.
-        algorithm: that searches, or several that follow one another.
-        key: of the random draws.
-        batch: plans evaluated at a time under one `vmap`; all that are asked for by default.
+        problem: problem to minimise.
+        algorithm: algorithm of the search, or a sequence of algorithms.
+        key: key of the random draws.
+        batch: number of plans evaluated at a time under one `vmap`; by default all plans of a
+            question.
     """
     space = problem.space
 
@@ -118,14 +119,15 @@ def search(
     run_stage: RunStage,
     evaluate: Callable[[Actions], Told],
 ) -> Optimum:
-    """Stage after stage: what both drivers do.
+    """Run the algorithms one after another, for both drivers.
 
     Args:
-        algorithm: that searches, or several that follow one another.
-        space: the plans that may be searched.
-        key: of the random draws.
-        run_stage: runs the exchanges of one algorithm.
-        evaluate: the cost of one plan, for an algorithm that returns another than the best.
+        algorithm: algorithm of the search, or a sequence of algorithms.
+        space: space of plans to search.
+        key: key of the random draws.
+        run_stage: function that runs the exchanges of one algorithm.
+        evaluate: function that evaluates one plan, for an algorithm whose answer is not the best
+            plan.
     """
     archive, failed = empty_archive(space, archive_size(algorithm)), jnp.zeros((), jnp.int32)
     records = []
@@ -144,21 +146,21 @@ def search(
 
 
 def archive_size(algorithm: Algorithm | Sequence) -> int:
-    """Plans that the archive must hold for the algorithms that start from it."""
+    """Size of the archive that the algorithms which start from it need."""
     return max(1, *(stage.num_starts for stage in stages(algorithm)))
 
 
 def begin(
     algorithm: Algorithm, space: ActionSpace, archive: Archive, failed: Int[Array, ""]
 ) -> Progress:
-    """Before the first question."""
+    """Progress before the first question."""
     return Progress(algorithm.init(space, archive), archive, failed)
 
 
 def ask(
     algorithm: Algorithm, space: ActionSpace, progress: Progress, key: PRNGKeyArray
 ) -> tuple[Progress, Plans, Actions]:
-    """A question: plans to evaluate, and their actions."""
+    """Ask a question: plans to evaluate, and their actions."""
     state, plans = algorithm.ask(space, progress.state, key)
     return Progress(state, progress.archive, progress.failed), plans, space.actions(plans)
 
@@ -166,15 +168,15 @@ def ask(
 def absorb(
     algorithm: Algorithm, space: ActionSpace, progress: Progress, plans: Plans, told: Told
 ) -> tuple[Progress, Recorded]:
-    """The answer to a question, and what is recorded of it."""
+    """Take in the evaluations of a question: the new progress, and a record."""
     failed = progress.failed + jnp.sum(~jnp.isfinite(told.costs), dtype=jnp.int32)
     told = finite(told)
-    if told.gradients is not None:  # by displacements: now by what they are in units of the limits
+    if told.gradients is not None:  # from metres to units of the limits
         limits = jnp.broadcast_to(space.limits, told.gradients.shape)
         told = Told(told.costs, told.gradients * limits)
     state = algorithm.tell(space, progress.state, plans, told)
     archive = progress.archive
-    if algorithm.wants != "settled":  # those are no costs
+    if algorithm.wants != "settled":  # settled scores are not costs
         archive = archived(archive, space, plans, told.costs)
     return Progress(state, archive, failed), (archive.costs[0], algorithm.trace(state))
 
@@ -188,7 +190,7 @@ def finish(algorithm: Algorithm, space: ActionSpace, progress: Progress) -> Acti
 
 
 def finite(told: Told) -> Told:
-    """Costs with infinity, and gradients with zero, for those that are not finite."""
+    """Replace costs that are not finite with infinity, and such gradients with zero."""
     gradients = told.gradients
     if gradients is not None:
         fine = jnp.isfinite(gradients).all(axis=(-3, -2, -1), keepdims=True)
@@ -197,7 +199,7 @@ def finite(told: Told) -> Told:
 
 
 def evaluation(problem: Problem, wants: Wants) -> Callable[[Actions], Told]:
-    """What is wanted of one plan; gradients are by its displacements."""
+    """Function that evaluates one plan as wanted; gradients are by its displacements."""
     if wants == "cost":
         return lambda actions: Told(problem.cost(actions))
     if wants == "settled":
@@ -210,7 +212,7 @@ def evaluation(problem: Problem, wants: Wants) -> Callable[[Actions], Told]:
 
 
 def _mapped(evaluate: Callable[[Actions], Told], plans: Actions, batch: int | None) -> Told:
-    """The evaluation of plans along a first axis."""
+    """Evaluate plans along a first axis."""
     if batch is None:
         return jax.vmap(evaluate)(plans)
     return jax.lax.map(evaluate, plans, batch_size=batch)

@@ -1,4 +1,4 @@
-"""Planner: algorithms run on the host, on all cores, with progress; and plans carried out."""
+"""Planner: runs algorithms on the host, on all cores, with progress; and carries out plans."""
 
 import dataclasses
 import time
@@ -34,16 +34,16 @@ from jaxsimp.tasks import Episode, Task
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A plan and how it was found.
+    """A plan and the record of its search.
 
     Attributes:
-        actions: shapes (T, G) and (T, G, 3).
+        actions: the plan, shapes (T, G) and (T, G, 3).
         optimum: costs by question, the best distinct plans, and failures.
-        num_rollouts: plans evaluated.
-        price: of the search, in rollouts: a gradient is more than one, see `PRICES`.
-        seconds: that the search took, compilation not included.
-        compile_seconds: that compilation took, next to nothing where an earlier plan has had as
-            many candidates and the same algorithm.
+        num_rollouts: number of plans evaluated.
+        price: price of the search, in rollouts: a gradient counts as several, see `PRICES`.
+        seconds: search time without compilation, seconds.
+        compile_seconds: compilation time, seconds; near 0 if an earlier plan had the same number
+            of candidates and the same algorithm.
     """
 
     actions: Actions
@@ -55,13 +55,13 @@ class Plan:
 
 
 class Planner:
-    """A task made ready to be planned for: what is compiled is kept for further plans.
+    """Planner of one task: it keeps compiled functions for further plans.
 
     Attributes:
-        task: what is planned for.
-        engine: that plans are costed in.
-        evaluator: engine that carries out plans, and scores them.
-        layout: of populations on this machine; None for the one measured to be best.
+        task: the task.
+        engine: engine that gives the costs of plans.
+        evaluator: engine that carries out the plan found, and scores it.
+        layout: layout of populations on this machine; None for the fastest in measurements.
     """
 
     def __init__(
@@ -71,24 +71,24 @@ class Planner:
         evaluator: Engine | None = None,
         layout: Layout | None = None,
     ) -> None:
-        """Nothing is compiled before it is needed.
+        """Make a planner; compilation waits until it is needed.
 
         Args:
-            task: what is planned for.
-            engine: that plans are costed in; by default our own dynamics, the body passing through
-                itself.
-            evaluator: engine that carries out plans; by default our own dynamics, the body
-                touching itself.
-            layout: of populations on this machine; by default the one measured to be best.
+            task: the task.
+            engine: engine that gives the costs of plans; by default our own dynamics, without
+                self-contact.
+            evaluator: engine that carries out the plan found; by default our own dynamics, with
+                self-contact.
+            layout: layout of populations on this machine; by default the fastest in measurements.
 
         Raises:
-            ValueError: if the engine refuses the task.
+            ValueError: if the engine cannot carry out plans of the task.
         """
         self.task, self.layout = task, layout
         self.engine = engine or MassSprings()
         self.evaluator = evaluator or MassSprings(self_contact=True)
         self._maps: dict[tuple[Wants, int], tuple[TaskProblem, PopulationMap]] = {}
-        # Evaluations do not look at candidates: any will do.
+        # Evaluations do not depend on the candidates.
         self._problem = self._host_problem(None)
 
     def plan(
@@ -103,14 +103,14 @@ class Planner:
 
         Args:
             episode: start and goal.
-            candidates: particles that may be grasped: key points, ids, or a mask.
-            algorithm: that searches, or several that follow one another; `CEM()` by default.
-            seed: of the random draws.
-            on_ask: called after each question of the algorithm.
+            candidates: particles that a picker may grasp: key points, ids, or a mask.
+            algorithm: algorithm of the search, or a sequence of algorithms; `CEM()` by default.
+            seed: seed of the random draws.
+            on_ask: function called after each question of the algorithm.
 
         Raises:
-            ValueError: if a candidate is no particle of the body, or the algorithm asks for
-                settled scores and the evaluator is no engine in JAX.
+            ValueError: if a candidate is not a particle of the body, or the algorithm asks for
+                settled scores and the evaluator is not an engine in JAX.
         """
         algorithm = algorithm or CEM()
         space = action_space(self.task, candidates)
@@ -129,15 +129,15 @@ class Planner:
         )
 
     def prepare(self, algorithm: Algorithm | Sequence, space: ActionSpace | None = None) -> float:
-        """Compile what an algorithm needs, and return the seconds that it took.
+        """Compile the functions of an algorithm, and return the compilation time, seconds.
 
         Args:
-            algorithm: that will search, or several that will follow one another.
-            space: the plans that will be searched; without it evaluations alone are compiled.
+            algorithm: algorithm of the search, or a sequence of algorithms.
+            space: space of plans to search; without it `prepare` compiles only the evaluations.
 
         Raises:
-            ValueError: if the algorithm asks for settled scores and the evaluator is no engine in
-                JAX.
+            ValueError: if the algorithm asks for settled scores and the evaluator is not an engine
+                in JAX.
         """
         start = time.perf_counter()
         for stage in stages(algorithm):
@@ -147,7 +147,7 @@ class Planner:
         return time.perf_counter() - start
 
     def costs(self, episode: Episode, actions: Actions) -> Float[np.ndarray, " B"]:
-        """Costs of plans: what a search minimises.
+        """Costs of plans, which a search minimises.
 
         Args:
             episode: start and goal.
@@ -160,9 +160,9 @@ class Planner:
         return np.asarray(self._told(as_float(episode), "cost", actions, size).costs)
 
     def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
-        """Seconds that a plan takes, from one evaluation of plans that grasp and move anything.
+        """Estimate the time of a search, seconds, from one evaluation of random plans.
 
-        With self-contact the folds that a search comes to take up to twice as long as those.
+        With self-contact, the folds that a search converges to take up to twice as long.
         """
         episode, seconds = as_float(self.task.episode_fn(0)), 0.0
         for stage in stages(algorithm):
@@ -182,7 +182,7 @@ class Planner:
         return self.evaluator.executor(self.task)
 
     def _random_plans(self, size: int) -> Actions:
-        """Plans that grasp and move anything."""
+        """Plans with random picks and displacements."""
         task, rng = self.task, np.random.default_rng(0)
         shape = (size, task.num_actions, task.num_pickers)
         picks = rng.integers(task.body.num_particles, size=shape)
@@ -190,15 +190,15 @@ class Planner:
         return Actions(jnp.asarray(picks), jnp.asarray(moves, float))
 
     def _told(self, episode: Episode, wants: Wants, actions: Actions, size: int) -> Told:
-        """What is wanted of at most `size` plans, evaluated on all cores."""
+        """Evaluate at most `size` plans on all cores."""
         problem, evaluate = self._evaluation(wants, size)
         return evaluate(dataclasses.replace(problem, episode=episode), actions)
 
     def _evaluation(self, wants: Wants, size: int) -> tuple[TaskProblem, PopulationMap]:
         """A problem, and its evaluation compiled for `size` plans.
 
-        Of that size and no other that is at hand: how a plan rounds depends on the size, and must
-        not depend on what was planned before.
+        An evaluation compiled for another size does not serve: rounding depends on the size, and
+        must not depend on earlier plans.
         """
         key = wants, size
         if key not in self._maps:
@@ -213,7 +213,7 @@ class Planner:
         return PopulationMap(partial(_evaluate, wants), problem, idle, layout)
 
     def layout_of(self, algorithm: Algorithm) -> Layout:
-        """How the plans of an algorithm's question are laid on this machine."""
+        """Layout of an algorithm's questions on this machine."""
         problem, _ = self._evaluation(algorithm.wants, algorithm.num_plans)
         return self._layout(problem, algorithm.wants, algorithm.num_plans)
 
@@ -230,7 +230,7 @@ class Planner:
         return self._host_problem(self.evaluator)
 
     def _host_problem(self, evaluator: SearchEngine | None) -> TaskProblem:
-        """The problem of the goal from the goal, with some candidate, and arrays on the host."""
+        """A problem with the goal as its start, one candidate, and arrays on the host."""
         goal = np.asarray(self.task.goal)
         found = make_problem(
             self.task, np.zeros(1, int), Episode(goal, goal), self.engine, evaluator
@@ -239,7 +239,7 @@ class Planner:
 
 
 def _largest_population(algorithm: Algorithm | Sequence) -> int:
-    """Plans that the costs of an algorithm are compiled for, at most; 1 if it asks for none."""
+    """Largest number of plans in a question for costs; 1 if the algorithm asks for none."""
     wanted = [stage.num_plans for stage in stages(algorithm) if stage.wants == "cost"]
     return max(wanted, default=1)
 
@@ -249,25 +249,25 @@ def _evaluate(wants: Wants, problem: TaskProblem, actions: Actions) -> Told:
 
 
 class _Bill:
-    """Evaluations of plans, counted.
+    """A function that evaluates plans, and counts them.
 
     Attributes:
-        num_plans: evaluated so far.
-        price: of them, in rollouts.
+        num_plans: number of plans evaluated so far.
+        price: price of these evaluations, in rollouts.
     """
 
     def __init__(self, evaluate: Callable[[Wants, Actions, int], Told], population: int) -> None:
-        """Nothing is counted yet.
+        """Start at a count of zero.
 
         Args:
-            evaluate: what is wanted of plans, compiled for as many plans as its last argument.
-            population: that the cost of one plan is compiled for.
+            evaluate: function that evaluates plans, compiled for as many as its last argument.
+            population: number of plans for which the cost of a single plan is compiled.
         """
         self._evaluate, self._population = evaluate, population
         self.num_plans = self.price = 0
 
     def __call__(self, wants: Wants, actions: Actions) -> Told:
-        """What is wanted of plans."""
+        """Evaluate plans."""
         self.num_plans += len(actions.pick)
         self.price += PRICES[wants] * len(actions.pick)
         is_one_cost = wants == "cost" and len(actions.pick) == 1

@@ -1,4 +1,4 @@
-"""Problems: what an algorithm minimises: plans of a task, costed in an engine, in an episode."""
+"""Problems, which algorithms minimise: the cost of plans of a task in an engine and an episode."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -17,12 +17,12 @@ from jaxsimp.simplification import KeyPoints
 from jaxsimp.tasks import Episode, Task
 
 Candidates = KeyPoints | Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]
-"""Particles that may be grasped: key points, ids, or a mask of the body's particles."""
+"""Particles that a picker may grasp: key points, ids, or a mask of the body's particles."""
 
 
 @runtime_checkable
 class Problem(Protocol):
-    """What `optimize` needs to know of a problem: a pytree with these functions of plans."""
+    """A problem for `optimize`: a pytree with these functions of plans."""
 
     @property
     def space(self) -> ActionSpace:
@@ -34,7 +34,7 @@ class Problem(Protocol):
         ...
 
     def settled_cost(self, actions: Actions) -> Float[Array, ""]:
-        """Cost of the state that a plan settles in; only called where an algorithm wants it."""
+        """Cost of the settled state after a plan; only called if an algorithm wants it."""
         ...
 
 
@@ -50,12 +50,12 @@ class TaskProblem:
     A pytree: `jax.vmap` applies over episodes, as `dataclasses.replace(problem, episode=...)`.
 
     Attributes:
-        space: the plans that may be searched.
+        space: space of plans to search.
         episode: start and goal.
-        physics: of the engine, that plans are costed in.
-        settled_physics: of the evaluator.
-        task: what is asked; static.
-        engine: that plans are costed in; static.
+        physics: physics of the engine.
+        settled_physics: physics of the evaluator.
+        task: the task; static.
+        engine: engine that gives the costs of plans; static.
         evaluator: engine that scores settled states, for algorithms that ask for them; static.
     """
 
@@ -87,7 +87,7 @@ class TaskProblem:
         )
 
     def chunk_size(self, wants: Wants) -> int:
-        """Plans that are evaluated fastest under one `vmap` on a core of a CPU."""
+        """Fastest number of plans under one `vmap` on a core of a CPU."""
         if wants == "settled" and self.evaluator is not None:
             return self.evaluator.chunk_size(self.settled_physics)
         return self.engine.chunk_size(self.physics)
@@ -103,15 +103,16 @@ def make_problem(
     """The problem of a task.
 
     Args:
-        task: what is asked.
-        candidates: particles that may be grasped.
+        task: the task.
+        candidates: particles that a picker may grasp.
         episode: start and goal; those of seed 0 by default.
-        engine: that plans are costed in; by default our own dynamics, the body passing through
-            itself.
+        engine: engine that gives the costs of plans; by default our own dynamics, without
+            self-contact.
         evaluator: engine that scores settled states; needed by algorithms that ask for them.
 
     Raises:
-        ValueError: if a candidate is no particle of the body, or an engine refuses the task.
+        ValueError: if a candidate is not a particle of the body, or an engine cannot carry out
+            plans of the task.
     """
     engine = engine or MassSprings()
     episode = episode or task.episode_fn(0)
@@ -127,10 +128,10 @@ def make_problem(
 
 
 def action_space(task: Task, candidates: Candidates) -> ActionSpace:
-    """The plans of a task over candidates.
+    """The space of a task's plans over candidates.
 
     Raises:
-        ValueError: if a candidate is no particle of the body.
+        ValueError: if a candidate is not a particle of the body.
     """
     given = candidates.particles if isinstance(candidates, KeyPoints) else candidates
     return ActionSpace(

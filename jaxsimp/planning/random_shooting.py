@@ -1,4 +1,4 @@
-"""Random shooting: draw plans evenly, keep the best. The least that a search can be."""
+"""Random shooting: draw plans uniformly, keep the best. The simplest search."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,11 @@ from jaxsimp.planning.space import ActionSpace, Plans
 
 @dataclass(frozen=True)
 class RandomShooting(Defaults):
-    """Plans with choices and displacements drawn evenly.
+    """Search over plans with uniformly drawn choices and displacements.
 
     Attributes:
-        num_asks: populations drawn.
-        num_plans: plans of a population.
+        num_asks: number of populations.
+        num_plans: number of plans in a population.
 
     Raises:
         ValueError: if a number is below 1.
@@ -31,7 +31,7 @@ class RandomShooting(Defaults):
                 raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
 
     def init(self, space: ActionSpace, archive: Archive) -> tuple[()]:
-        """Nothing is remembered."""
+        """The empty state."""
         return ()
 
     def ask(
@@ -45,5 +45,5 @@ class RandomShooting(Defaults):
         return state, Plans(choice, move)
 
     def tell(self, space: ActionSpace, state: tuple[()], plans: Plans, told: Told) -> tuple[()]:
-        """The archive keeps the best."""
+        """The empty state: the archive keeps the best plans."""
         return state

@@ -1,4 +1,4 @@
-"""Reranking: of the best distinct plans of a search, the one that settles best."""
+"""Reranking: choose the plan with the best settled state among the best distinct plans."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +16,7 @@ from jaxsimp.planning.space import ActionSpace, Plans
 @partial(jax.tree_util.register_dataclass, data_fields=["plans", "costs"], meta_fields=[])
 @dataclass(frozen=True)
 class Ranking:
-    """Plans and what they cost when they have settled, leading axis `num_plans`."""
+    """Plans and the costs of their settled states, leading axis `num_plans`."""
 
     plans: Plans
     costs: Float[Array | np.ndarray, " B"]
@@ -24,13 +24,13 @@ class Ranking:
 
 @dataclass(frozen=True)
 class Reranking(Defaults):
-    """Carry out the best distinct plans in the physics that scores; return the best of them.
+    """Carry out the best distinct plans in the evaluator's physics; return the best of them.
 
     Attributes:
-        num_starts: plans that are carried out.
+        num_starts: number of plans to carry out.
 
     Raises:
-        ValueError: if it is below 1.
+        ValueError: if `num_starts` is below 1.
     """
 
     num_starts: int = 8
@@ -42,16 +42,16 @@ class Reranking(Defaults):
 
     @property
     def num_asks(self) -> int:
-        """It asks once."""
+        """One question."""
         return 1
 
     @property
     def num_plans(self) -> int:
-        """Plans that are carried out."""
+        """Number of plans to carry out."""
         return self.num_starts
 
     def init(self, space: ActionSpace, archive: Archive) -> Ranking:
-        """The best archived plans, copies of the best where there are fewer."""
+        """The best archived plans, padded with copies of the best if there are fewer."""
         return Ranking(archive.best(self.num_starts), archive.costs[: self.num_starts])
 
     def ask(self, space: ActionSpace, state: Ranking, key: PRNGKeyArray) -> tuple[Ranking, Plans]:
@@ -59,10 +59,10 @@ class Reranking(Defaults):
         return state, state.plans
 
     def tell(self, space: ActionSpace, state: Ranking, plans: Plans, told: Told) -> Ranking:
-        """What they cost when they have settled."""
+        """The plans with the costs of their settled states."""
         return Ranking(plans, told.costs)
 
     def answer(self, space: ActionSpace, state: Ranking) -> Plans:
-        """The plan that settles best; the best by cost where none is finite."""
+        """The plan with the best settled state; the best by cost if no settled cost is finite."""
         best = jnp.argmin(state.costs)
         return jax.tree.map(lambda leaf: leaf[best], state.plans)

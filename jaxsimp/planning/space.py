@@ -1,4 +1,4 @@
-"""The plans that may be searched: candidates, limits, and plans in units of them."""
+"""The space of plans: candidates, limits, and plans in units of the limits."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +14,7 @@ from jaxsimp.dynamics import NONE, Actions
 @partial(jax.tree_util.register_dataclass, data_fields=["choice", "direction"], meta_fields=[])
 @dataclass(frozen=True)
 class Plans:
-    """Plans as algorithms see them: numbers of candidates, and displacements without unit.
+    """Plans in the form for algorithms: indices of candidates, and dimensionless displacements.
 
     Attributes:
         choice: index of the grasped candidate, K for none, shape (*B, T, G).
@@ -32,13 +32,13 @@ class Plans:
 )
 @dataclass(frozen=True)
 class ActionSpace:
-    """The plans that may be searched.
+    """The space of plans to search.
 
     Attributes:
-        candidates: ids of the particles that may be grasped, shape (K,).
+        candidates: ids of the particles that a picker may grasp, shape (K,).
         limits: largest displacement of one action along x, y, z, shape (3,), metres.
-        num_actions: `T`, static.
-        num_pickers: `G`, static.
+        num_actions: number of actions in a plan, `T`; static.
+        num_pickers: number of pickers, `G`; static.
     """
 
     candidates: Int[Array, " K"]
@@ -56,14 +56,14 @@ class ActionSpace:
 def as_candidates(
     candidates: Int[np.ndarray, " K"] | Bool[np.ndarray, " N"], num_particles: int
 ) -> Int[np.ndarray, " K"]:
-    """Ids of the particles that may be grasped, from ids or from a mask of particles.
+    """Ids of the candidates, from ids or from a mask of particles.
 
     Args:
         candidates: ids, shape (K,), or a mask that is True at the candidates, shape (N,).
-        num_particles: of the body, `N`.
+        num_particles: number of particles of the body, `N`.
 
     Raises:
-        ValueError: if there is no candidate, an id is no particle of the body or is given twice,
+        ValueError: if there is no candidate, an id is not a particle of the body or occurs twice,
             or the array has another shape or type.
     """
     given = np.asarray(candidates)

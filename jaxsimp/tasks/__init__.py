@@ -1,7 +1,7 @@
-"""Tasks: a body, where it starts, where it should end, and what states and actions cost.
+"""Tasks: a body, its start and goal, and the costs of states and actions.
 
-A task is made by a factory that takes the resolution; `register` adds the factory to the registry.
-The four tasks of the paper are after SoftGym and fabric-vsf. A task of one's own is one file:
+A factory makes a task from the resolution; `register` adds the factory to the registry. The four
+tasks of the paper are after SoftGym and fabric-vsf. A new task is one file:
 
 ```python
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ def terminal_cost(episode, state):
 
 
 def running_cost(episode, state, action):
-    # The same, and a little for long ways.
+    # The same, plus a small cost of long displacements.
     return terminal_cost(episode, state) + 0.01 * jnp.abs(action.displacement).sum()
 
 
@@ -37,8 +37,8 @@ def rope_letter_s(resolution):
     )
 ```
 
-Functions of a module and instances of its classes can be pickled, and so can a task that is made of
-them; a lambda cannot.
+Functions of a module and instances of its classes can be pickled, and so can a task made of them; a
+lambda cannot.
 """
 
 # The modules of tasks register them, in this order.

@@ -16,27 +16,27 @@ from jaxsimp.tasks.episode import DrawFn, Episode, RunningCost, TerminalCost
 
 
 def check_count(name: str, value: object, least: int) -> None:
-    """Refuse a value that is no whole number of at least `least`.
+    """Check that a value is a whole number of at least `least`.
 
     Raises:
-        ValueError: if the value is none.
+        ValueError: if it is not.
     """
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name} is {value}; give a whole number of at least {least}")
 
 
 def check_seconds(name: str, value: object) -> None:
-    """Refuse a value that is no positive, finite number.
+    """Check that a value is a positive, finite number.
 
     Raises:
-        ValueError: if the value is none.
+        ValueError: if it is not.
     """
     if not _is_positive(value):
         raise ValueError(f"{name} is {value}; give a positive, finite number of seconds")
 
 
 def check_limits(limits: object) -> None:
-    """Refuse limits that are not three positive, finite numbers.
+    """Check that limits are three positive, finite numbers.
 
     Raises:
         ValueError: if they are not.
@@ -51,9 +51,9 @@ def check_limits(limits: object) -> None:
 def check_costs(
     running_cost: RunningCost, terminal_cost: TerminalCost, num_particles: int, num_pickers: int
 ) -> None:
-    """Refuse costs that JAX cannot compile, or that are no float scalars.
+    """Check that JAX can compile the costs, and that each returns a float scalar.
 
-    The costs are traced with arrays that have a shape and no values; nothing is computed.
+    The check traces the costs with abstract arrays, of a shape and no values; it computes nothing.
 
     Args:
         running_cost: cost of an episode, a state and an action.
@@ -62,7 +62,7 @@ def check_costs(
         num_pickers: number of pickers, `G`.
 
     Raises:
-        ValueError: if a cost takes other arguments, fails, or returns anything but one float.
+        ValueError: if a cost takes other arguments, fails, or does not return one float.
     """
     for name, cost, arguments in (
         ("running_cost", running_cost, ("episode", "state", "action")),
@@ -73,7 +73,7 @@ def check_costs(
 
 
 def check_draw(draw_fn: DrawFn, num_particles: int) -> None:
-    """Refuse a function that does not make an episode of `num_particles` from a key.
+    """Check that a function makes an episode of `num_particles` from a key.
 
     Raises:
         ValueError: if the function fails under a trace, or returns anything else.
@@ -105,7 +105,7 @@ def _check_cost(
     num_pickers: int,
     arguments: tuple[str, ...],
 ) -> None:
-    """Refuse one cost; `arguments` are names of what it takes: the first of the examples."""
+    """Check one cost; `arguments` names its arguments: the first of the examples."""
     try:
         inspect.signature(cost).bind(*arguments)
     except TypeError as error:
@@ -139,7 +139,7 @@ def _is_hashable(cost: Callable[..., Any]) -> bool:
 
 
 def _trace(name: str, call: Callable[[], Any], remedy: str) -> PyTree[Any]:
-    """Shapes and types of what a call returns; a failure of it is refused with the remedy."""
+    """Shapes and types of a call's result; a failure raises `ValueError` with the remedy."""
     try:
         return jax.eval_shape(call)
     except (jax.errors.JAXTypeError, jax.errors.JAXIndexError) as error:

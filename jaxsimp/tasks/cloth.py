@@ -16,15 +16,14 @@ from jaxsimp.tasks.starts import TurnedStart
 from jaxsimp.tasks.task import Task
 
 STILL_WEIGHT = 1.2
-"""Weight of the displacement of the half that should lie still, after SoftGym."""
+"""Weight of the displacement of the still half, after SoftGym."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoldCost:
     """Cost of a fold in half: `mean |a_i - b_i| + 1.2 mean |b_i - b_i(0)|`, metres.
 
-    `a` is the moving half and `b` its mirror image in the half that should lie still, as in
-    SoftGym.
+    `a` is the moving half and `b` its mirror image in the still half, as in SoftGym.
 
     Attributes:
         moving: ids of the particles of the moving half, shape (M,).
@@ -115,7 +114,7 @@ def _folds_task(body: Body, folds: str, num_actions: int) -> Task:
 
 
 def flat_task(body: Body, goal: goals.Positions, num_actions: int) -> Task:
-    """A goal from a flat start that is turned at random within 45 degrees.
+    """A task from a flat start, turned by a random angle within 45 degrees, to a goal.
 
     The cost is the mean distance of the particles to their goals.
     """

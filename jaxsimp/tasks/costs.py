@@ -27,7 +27,7 @@ def distance_cost(
 
 @dataclass(frozen=True)
 class MatchingCost:
-    """SoftGym's bipartite matching distance between 11 particles, evenly chosen, and their goals.
+    """SoftGym's bipartite matching distance between 11 evenly spaced particles and their goals.
 
     The mean distance in the best assignment, metres.
 
@@ -46,7 +46,7 @@ class MatchingCost:
 
     @property
     def chosen(self) -> Int[np.ndarray, " M"]:
-        """Ids of the particles that are compared."""
+        """Ids of the compared particles."""
         evenly = np.linspace(0, self.num_particles - 1, MATCHED_PARTICLES)
         return np.unique(np.round(evenly).astype(int))
 
@@ -63,5 +63,5 @@ def matching_distance(
 def distance(difference: Float[Array, "*M 3"]) -> Float[Array, "*M"]:
     """Euclidean length, with a finite gradient where it is zero."""
     squared = jnp.sum(jnp.square(difference), axis=-1)
-    apart = squared != 0  # a distance that is not a number stays none
+    apart = squared != 0  # NaN stays NaN
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)

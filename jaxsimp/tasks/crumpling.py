@@ -25,14 +25,14 @@ FARTHEST = (0.3, 0.3, 0.6)
 SECONDS = 0.5
 """Duration of a pick, seconds."""
 TOP_SPEED = 1.5 * float(np.linalg.norm(FARTHEST)) / SECONDS
-"""Speed of a pick at the middle of the longest way, metres per second."""
+"""Speed of a pick at the middle of the longest displacement, metres per second."""
 
 
 def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
     """A random settled state of a body, shape (N, 3): SoftGym's four random picks.
 
     Each pick carries a random particle up to 0.3 m sideways and 0.6 m up, and drops it. The body
-    touches itself: parts lie on each other, and what is pulled apart need not pass through itself.
+    has self-contact: parts lie on each other, and a plan can pull them apart without tunnelling.
 
     Args:
         body: the body; it starts straight or flat on the table.
@@ -49,7 +49,7 @@ def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
 
 @cache
 def _drop(body: Body) -> Callable[[Actions], Float[Array, "N 3"]]:
-    """Carry out one action after another on a flat body, letting it settle after each."""
+    """Function that carries out actions on a flat body, which settles after each."""
     time_step = min(1e-3, 0.9 * largest_time_step(body))
     simulation = make_simulation(body, time_step, self_contact=True, top_speed=TOP_SPEED)
     pickers = make_pickers(FARTHEST, steps=round(SECONDS / time_step))

@@ -1,4 +1,4 @@
-"""An episode, and the functions of one that a task is made of."""
+"""Episodes, and the types of a task's functions of an episode."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from jaxsimp.dynamics import Actions, State
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
 @dataclass(frozen=True)
 class Episode:
-    """Where one run starts and where it should end.
+    """Start and goal of one run.
 
     Attributes:
-        start: positions, shape (N, 3), metres; a batch has axes before.
-        goal: positions, of the same shape, metres.
+        start: positions at the start, shape (N, 3), metres; a batch has leading axes.
+        goal: goal positions, of the same shape, metres.
     """
 
     start: Float[Array | np.ndarray, "... N 3"]
@@ -28,7 +28,7 @@ class Episode:
 EpisodeFn = Callable[[int], Episode]
 """The episode of a seed."""
 DrawFn = Callable[[PRNGKeyArray], Episode]
-"""A random episode, drawn by a key; pure JAX."""
+"""A random episode from a key; pure JAX."""
 RunningCost = Callable[[Episode, State, Actions], Float[Array, ""]]
 """Cost of the state at the end of an action, and of that action, shapes (G,) and (G, 3)."""
 TerminalCost = Callable[[Episode, State], Float[Array, ""]]

@@ -32,12 +32,12 @@ def register(
 ) -> Callable[[TaskFactory], TaskFactory]:
     """Add a task to the registry, under the name of the function that makes it.
 
-    The function then gives its tasks this name and the resolution that they are made with.
+    The decorated function gives its tasks this name and their resolution.
 
     Args:
-        full: resolution of the task as it is studied.
+        full: resolution for studies.
         quick: resolution for tests and smoke runs.
-        group: name of a group of tasks that are studied together: "paper" or "goals" here.
+        group: name of a group of tasks in one study: "paper" or "goals" here.
 
     Raises:
         ValueError: if the name is taken.
@@ -59,7 +59,7 @@ def register(
 
 
 def _named(task: Task, name: str, resolution: int) -> Task:
-    """The task with a name and a resolution; what was checked is not checked again."""
+    """The task with a name and a resolution, without a second check."""
     named = copy.copy(task)
     object.__setattr__(named, "name", name)
     object.__setattr__(named, "resolution", resolution)
@@ -76,12 +76,12 @@ def make_task(name: str, resolution: int | None = None, *, quick: bool = False) 
 
     Args:
         name: one of `task_names()`.
-        resolution: particles along the rope or along a side of the cloth; a garment has its
-            square of them. By default that of the full or the quick scale.
-        quick: which of the two scales is the default.
+        resolution: number of particles along the rope or along a side of the cloth; a garment has
+            the square of this number. By default that of the full or the quick scale.
+        quick: whether the default resolution is that of the quick scale.
 
     Raises:
-        ValueError: if there is no such task, or the resolution is no whole number or too low.
+        ValueError: if there is no such task, or the resolution is not a whole number or too low.
     """
     if name not in _REGISTRY:
         raise ValueError(f"unknown task {name!r}; choose from {', '.join(_REGISTRY)}")

@@ -52,8 +52,8 @@ def rope_straightening(resolution: int) -> Task:
 def rope_folding(resolution: int) -> Task:
     """Lay a straight rope along two sides of an equilateral triangle, its corner at the middle.
 
-    The cost is SoftGym's bipartite matching distance between 11 particles, evenly chosen, and
-    their goal positions: the mean distance in the best assignment.
+    The cost is SoftGym's bipartite matching distance between 11 evenly spaced particles and their
+    goal positions: the mean distance in the best assignment.
     """
     body = rope(resolution, ROPE_LENGTH)
     side = body.size / 2
@@ -88,13 +88,13 @@ def rope_letter_u(resolution: int) -> Task:
 
 @register(full=41, quick=21, group="goals")
 def rope_crossed_triangle(resolution: int) -> Task:
-    """Lay a straight rope as a triangle whose two ends cross and go on."""
+    """Lay a straight rope as a triangle whose two ends cross and continue."""
     body = rope(resolution, ROPE_LENGTH)
     return _shape_task(body, goals.crossed_triangle(body))
 
 
 def _shape_task(body: Body, goal: goals.Positions) -> Task:
-    """A goal from a straight start; the cost is the mean distance of particles to their goals."""
+    """A task from a straight start; the cost is the particles' mean distance to their goals."""
     start = FixedStart(Episode(goals.straight(body), goal))
     return Task(
         body=body,

@@ -1,7 +1,7 @@
 """Starts and goals of episodes: always the same, turned at random, or crumpled.
 
-A start is called with a seed and makes an episode in NumPy. A start that needs no simulation also
-has `draw`, which makes an episode from a key, in pure JAX.
+A start is a function from a seed to an episode in NumPy. A start that needs no simulation also has
+`draw`, a function from a key to an episode, in pure JAX.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.episode import Episode
 
 LARGEST_ANGLE = np.pi / 4
-"""Largest angle, radians, by which `TurnedStart` turns a body either way, as in SoftGym."""
+"""Largest angle of `TurnedStart` either way, radians, as in SoftGym."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class FixedStart:
         return self.episode
 
     def draw(self, key: PRNGKeyArray) -> Episode:
-        """The episode as arrays of JAX, whatever the key."""
+        """The episode as arrays of JAX, the same for every key."""
         return jax.tree.map(_as_float, self.episode)
 
 
@@ -45,7 +45,7 @@ class TurnedStart:
 
     Attributes:
         body: the body.
-        goal: goal of the body that is not turned, shape (N, 3), metres.
+        goal: goal before the turn, shape (N, 3), metres.
     """
 
     body: Body
@@ -69,14 +69,14 @@ class CrumpledStart:
 
     Attributes:
         body: the body; it starts straight or flat on the table.
-        goal: shape (N, 3), metres.
+        goal: goal positions, shape (N, 3), metres.
     """
 
     body: Body
     goal: goals.Positions
 
     def __call__(self, seed: int) -> Episode:
-        """The episode of a seed; it takes a simulation."""
+        """The episode of a seed; this runs a simulation."""
         return Episode(crumple(self.body, seed), self.goal)
 
 

@@ -1,4 +1,4 @@
-"""What a task is, and how states are scored."""
+"""Tasks, and the score of states."""
 
 from dataclasses import dataclass
 
@@ -27,9 +27,9 @@ class Task:
     """A body, its start and goal, and the costs that a planner minimises.
 
     Attributes:
-        body: the body that is manipulated.
-        goal: positions that key points are found in, shape (N, 3), metres.
-        episode_fn: makes start and goal from a seed.
+        body: the body to manipulate.
+        goal: goal positions for the search of key points, shape (N, 3), metres.
+        episode_fn: function from a seed to an episode, start and goal.
         running_cost: cost of an episode, the state at the end of an action, and that action,
             shapes (G,) and (G, 3): a scalar, at least 0; pure JAX.
         terminal_cost: cost of an episode and the settled state: a scalar, at least 0; pure JAX.
@@ -37,18 +37,19 @@ class Task:
         num_actions: number of actions in a plan, `T`.
         num_pickers: number of pickers, `G`.
         action_seconds: duration of one action, seconds.
-        settle_actions: time that passes with nothing held, after the last action and before the
-            plan is scored, in multiples of `action_seconds`.
-        longest_time_step: bound on the time step of the simulation, seconds.
-        draw_fn: makes start and goal from a key, in pure JAX; None where only a seed makes them.
+        settle_actions: time with nothing held, between the last action and the score, in multiples
+            of `action_seconds`.
+        longest_time_step: upper bound on the time step of the simulation, seconds.
+        draw_fn: function from a key to an episode, in pure JAX; None if `episode_fn` alone makes
+            episodes.
         name: name of the task; for a registered task that of its factory, see `register`.
-        resolution: resolution that a registered task was made with, see `make_task`; None for a
-            task that is not registered.
+        resolution: resolution of a registered task, see `make_task`; None for a task that is not
+            registered.
 
     Raises:
-        ValueError: if the goal is refused (see `goals.check_goal`), a number is out of its range,
-            a cost cannot be compiled or is no float scalar, or `draw_fn` draws no episode of
-            the body.
+        ValueError: if `goals.check_goal` raises for the goal, a number is out of its range, JAX
+            cannot compile a cost, a cost is not a float scalar, or `draw_fn` does not draw an
+            episode of the body.
     """
 
     body: Body
@@ -80,7 +81,7 @@ class Task:
             check_draw(self.draw_fn, self.body.num_particles)
 
     def draw_episode(self, key: PRNGKeyArray) -> Episode:
-        """A random episode, drawn by a key: pure JAX, to which `jit` and `vmap` over keys apply.
+        """A random episode from a key: pure JAX, to which `jit` and `vmap` over keys apply.
 
         Starts and goals have the same distribution as those of `episode_fn`.
 
@@ -98,7 +99,7 @@ class Task:
         """The body's simulation, at the task's time step.
 
         Args:
-            self_contact: whether the body touches itself, at speeds that the task allows.
+            self_contact: whether the body touches itself, at picker speeds up to `top_speed`.
 
         Raises:
             ValueError: if the body has no thickness, or pickers are too fast, for self-contact.
@@ -109,21 +110,21 @@ class Task:
 
     @property
     def top_speed(self) -> float:
-        """Fastest that a picker moves, metres per second: at the middle of its longest way."""
+        """Largest speed of a picker, metres per second: midway along its longest displacement."""
         return 1.5 * float(np.linalg.norm(self.limits)) / self.action_seconds
 
     def pickers(self) -> Pickers:
-        """How the pickers may move, at the task's time step."""
+        """Limits of the pickers' motion, at the task's time step."""
         return make_pickers(self.limits, steps=self.action_steps)
 
     @property
     def time_step(self) -> float:
-        """Seconds: nine tenths of the largest stable one, and at most `longest_time_step`."""
+        """Time step, seconds: 0.9 of the largest stable one, and at most `longest_time_step`."""
         return min(self.longest_time_step, 0.9 * largest_time_step(self.body))
 
     @property
     def action_steps(self) -> int:
-        """Time steps of one action."""
+        """Number of time steps of one action."""
         return round(self.action_seconds / self.time_step)
 
 
@@ -145,8 +146,8 @@ def score(
     start = task.terminal_cost(episode, at_rest(episode.start))
     ratio = _saved(start, task.terminal_cost(episode, state))
 
-    # Division by a start of no cost gives -inf, or no number where both costs are zero. The cost is
-    # taken again in that case alone: a second use of it would change how XLA rounds the ratio.
+    # Division by a start of zero cost gives -inf, or NaN if both costs are zero. Only that case
+    # uses the cost again: a second use of it would change how XLA rounds the ratio.
     def of_free_start(state: State) -> Float[Array, ""]:
         cost = task.terminal_cost(episode, state)
         return jnp.where(cost == 0, 1.0, jnp.nan).astype(ratio.dtype)
@@ -156,7 +157,7 @@ def score(
 
 @jax.custom_jvp
 def _saved(start: Float[Array, ""], cost: Float[Array, ""]) -> Float[Array, ""]:
-    """The part of the start's cost that is saved; its gradient is 0 where the start has no cost."""
+    """The saved fraction of the start's cost; its gradient is 0 if the start has zero cost."""
     return (start - cost) / start
 
 

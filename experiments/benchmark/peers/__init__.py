@@ -1,8 +1,8 @@
-"""The same rollouts by other means: what jaxsimp's speed is compared with.
+"""The same rollouts in other implementations, for comparison with jaxsimp's speed.
 
 An engine is a function that prepares a `Workload`, compilation included, and returns a function
-that computes its final positions, shape (B, N, 3), metres. One that needs a compiler or a
-library that is not there raises `UnavailableError`.
+that computes its final positions, shape (B, N, 3), metres. It raises `UnavailableError` if the
+compiler or library that it needs is missing.
 """
 
 import importlib
@@ -20,7 +20,7 @@ Engine = Callable[[Workload], Callable[[], np.ndarray]]
 
 
 def _peer(module: str, workload: Workload) -> Callable[[], np.ndarray]:
-    """An engine of the extra `peers`, imported when it is asked for."""
+    """Prepare an engine of the extra `peers`, imported on demand."""
     os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
     try:
         found = importlib.import_module(f"experiments.benchmark.peers.{module}")
@@ -38,4 +38,4 @@ ENGINES: dict[str, tuple[str, str, Engine]] = {
     "numpy": ("numpy", f"1 thread, chunks of {numpy_step.CHUNK_SIZE}", numpy_step.prepare),
     "edge_list_vmap": ("edge_list_vmap", "one vmap", edge_list.prepare),
 }
-"""What it is, how the population is laid on the machine, and the engine."""
+"""Kind of each engine, its layout of the population, and the engine."""

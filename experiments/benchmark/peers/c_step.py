@@ -1,4 +1,4 @@
-"""The step in C, compiled on the spot for one body, one call a sample."""
+"""The step in C, compiled at run time for one body, one call per sample."""
 
 import ctypes
 import shutil
@@ -25,9 +25,9 @@ FLAGS = (
     ("-march=native", "-ffast-math", "-fopenmp-simd"),
     ("-ffast-math",),
 )
-"""Sets of flags, the fastest first: the first that the compiler accepts is taken."""
+"""Sets of flags, the fastest first; the first that the compiler accepts is in use."""
 MAX_OFFSETS = 32
-"""Loops over more would not unroll: such a body is no rope and no grid."""
+"""Largest number of offsets: loops over more do not unroll. Ropes and grids have fewer."""
 
 
 class _Physics(ctypes.Structure):
@@ -41,8 +41,8 @@ def prepare(workload: Workload, num_threads: int) -> Callable[[], np.ndarray]:
     """A function giving the final positions, shape (B, N, 3), metres.
 
     Args:
-        workload: what is computed.
-        num_threads: that share the samples; the calls do not hold the interpreter's lock.
+        workload: workload to compute.
+        num_threads: number of threads for the samples; the calls release the interpreter's lock.
 
     Raises:
         UnavailableError: if there is no C compiler, or the springs have too many offsets.
@@ -77,8 +77,8 @@ def prepare(workload: Workload, num_threads: int) -> Callable[[], np.ndarray]:
 def _compile(springs: Offsets) -> Callable[..., int]:
     """The C function for a body with these springs.
 
-    Compiled and linked apart: linking with -ffast-math would change the floating-point mode of
-    the thread that loads the library.
+    Compilation and linking are separate steps: linking with -ffast-math would change the
+    floating-point mode of the thread that loads the library.
     """
     if len(springs.offsets) > MAX_OFFSETS:
         raise UnavailableError(
@@ -86,7 +86,7 @@ def _compile(springs: Offsets) -> Callable[..., int]:
         )
     compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
     if compiler is None:
-        raise UnavailableError(f"no C compiler is there ({', '.join(COMPILERS)})")
+        raise UnavailableError(f"no C compiler found ({', '.join(COMPILERS)})")
     macros = (
         f"-DNUM_PARTICLES={springs.stiffness.shape[1]}",
         f"-DHALO={springs.offsets.max()}",

@@ -1,4 +1,4 @@
-"""The obvious JAX: gather the ends of every spring, scatter-add the forces, `vmap` it all."""
+"""The step in plain JAX: gather the ends of every spring, scatter-add the forces, `vmap` it all."""
 
 from collections.abc import Callable
 

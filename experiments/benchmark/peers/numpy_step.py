@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from experiments.benchmark.peers.workload import GRAVITY, Workload, by_offset
 
 CHUNK_SIZE = 32
-"""Samples stepped together: measured best of 1 to 32 for a cloth of 25 a side, by up to 6 times."""
+"""Samples stepped together: the fastest of 1 to 32, by up to 6 times, for a 25 x 25 cloth."""
 Array = np.ndarray
 
 
@@ -51,7 +51,7 @@ def _forces_fn(workload: Workload) -> Callable[[Array, Array], Array]:
         for row, offset in enumerate(springs.offsets):
             here = slice(0, -offset)
             along, speed = x[:, offset:] - x[:, here], v[:, offset:] - v[:, here]
-            # In place where it can be: half the time goes into new arrays otherwise.
+            # In place if possible: otherwise half the time goes into new arrays.
             speed *= along
             rate = speed[0] + speed[1]
             rate += speed[2]

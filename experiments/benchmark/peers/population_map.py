@@ -1,4 +1,4 @@
-"""jaxsimp itself: its rollout, laid on the machine by its PopulationMap."""
+"""jaxsimp itself: its rollout, run by its PopulationMap."""
 
 from collections.abc import Callable
 
@@ -19,15 +19,15 @@ from jaxsimp.dynamics import (
 from jaxsimp.engines import Layout, PopulationMap, default_layout, spring_chunk_size
 
 Physics = tuple[Simulation, Pickers, Array]
-"""A simulation, its pickers, and the positions at first."""
+"""A simulation, its pickers, and the positions at the start."""
 
 
 def prepare(workload: Workload, layout: Layout | None = None) -> Callable[[], np.ndarray]:
     """A function giving the final positions, shape (B, N, 3), metres.
 
     Args:
-        workload: what is computed.
-        layout: of the population; jaxsimp's own choice by default.
+        workload: workload to compute.
+        layout: layout of the population; jaxsimp's own choice by default.
     """
     shared, actions = physics(workload), plans(workload)
     layout = layout or default_layout(workload.population, spring_chunk_size(shared[0]))
@@ -42,7 +42,7 @@ def final_position(physics: Physics, actions: Actions) -> Array:
 
 
 def physics(workload: Workload) -> Physics:
-    """The workload's body, with pickers whose limits do not bind."""
+    """The workload's physics, with pickers whose limits do not bind."""
     pickers = make_pickers((1.0, 1.0, 1.0), max_stretch=1e6, steps=workload.action_steps)
     simulation = make_simulation(workload.body, workload.time_step, GRAVITY)
     return simulation, pickers, jnp.asarray(workload.start, dtype=float)

@@ -1,10 +1,10 @@
 """The step in Taichi on the CPU: a thread runs whole rollouts, sixteen side by side.
 
-Vectors hold a number of sixteen samples each, which compiles to vector instructions; forces are
-added up spring by spring. Measured in turns and slower: samples one by one with springs by
-neighbour, on one thread (about a tenth of the speed), 8 samples side by side, ndarrays instead of
-fields, and reciprocal roots by Newton's method. 32 side by side gain 4 % and take three times as
-long to compile.
+A vector holds one number of each of sixteen samples, which compiles to vector instructions; forces
+are summed spring by spring. Slower, in turns: samples one by one with springs by neighbour, on one
+thread (about a tenth of the speed), 8 samples side by side, ndarrays instead of fields, and
+reciprocal roots by Newton's method. 32 side by side are 4 % faster and take three times as long to
+compile.
 """
 
 import contextlib
@@ -26,9 +26,9 @@ from experiments.benchmark.peers.workload import (
 LANES = 16
 """Samples side by side."""
 SHARE = 512
-"""Fewest iterations that Taichi gives a thread: shorter loops would run on one thread."""
+"""Smallest number of iterations per thread in Taichi: shorter loops would run on one thread."""
 
-# Once: it invalidates every field. Without a cache, so that compilation is timed as such.
+# Once: it invalidates every field. Without a cache, so that timings include compilation.
 with contextlib.redirect_stdout(io.StringIO()):  # a banner
     ti.init(arch=ti.cpu, fast_math=True, offline_cache=False, log_level=ti.ERROR)
 
@@ -55,7 +55,7 @@ def prepare(workload: Workload) -> Callable[[], np.ndarray]:
     @ti.kernel
     def rollouts():
         for t in range(blocks * SHARE):
-            # One block, or none.
+            # At most one block.
             for b in range((t + SHARE - 1) // SHARE, t // SHARE + 1):
                 for i in range(count):
                     for c in ti.static(range(9)):

@@ -1,4 +1,4 @@
-"""What every engine computes: a population of rollouts that needs no rule of grasping.
+"""The workload of every engine: a population of rollouts that needs no rule of grasping.
 
 The plans are drawn so that no limit, table or stretch rule of the pickers binds: an engine only
 has to carry the picked particles along their displacements.
@@ -24,15 +24,15 @@ class UnavailableError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """A population of rollouts of a body that lies flat on the table at first.
+    """A population of rollouts of a body that starts flat on the table.
 
     Attributes:
-        body: what moves.
-        time_step: seconds.
-        action_steps: time steps of one action.
+        body: the body.
+        time_step: time step, seconds.
+        action_steps: number of time steps of one action.
         pick: ids of the particles carried, shape (B, T, G), none twice in an action.
-        displacement: of the pickers, shape (B, T, G, 3), metres, not downwards, and the same
-            for all pickers of an action.
+        displacement: displacements of the pickers, shape (B, T, G, 3), metres, not downwards, and
+            the same for all pickers of an action.
     """
 
     body: Body
@@ -54,19 +54,19 @@ class Workload:
 
     @property
     def start(self) -> Float[np.ndarray, "N 3"]:
-        """Positions at first, metres."""
+        """Positions at the start, metres."""
         return self.body.rest + np.array([0.0, 0.0, self.body.radius])
 
     @property
     def shares(self) -> Float[np.ndarray, " steps"]:
-        """Share of a displacement made in each step of an action: the parabola of jaxsimp."""
+        """Fraction of a displacement in each step of an action: the parabola of jaxsimp."""
         middle = (np.arange(self.action_steps) + 0.5) / self.action_steps
         speed = middle * (1 - middle)
         return speed / speed.sum()
 
     @property
     def shortest(self) -> float:
-        """Length under which the direction of a spring is regularised, metres."""
+        """Length below which the direction of a spring is regularised, metres."""
         return 1e-3 * self.body.spacing
 
 
@@ -76,11 +76,11 @@ def make_workload(
     """Rollouts with two pickers, at nine tenths of the largest stable time step, at most 2 ms.
 
     Args:
-        body: what moves.
+        body: the body.
         population: number of rollouts, `B`.
-        num_actions: in each, `T`.
-        action_steps: time steps of one action.
-        seed: of the plans.
+        num_actions: number of actions in each, `T`.
+        action_steps: number of time steps of one action.
+        seed: seed of the plans.
     """
     random = np.random.default_rng(seed)
     time_step = min(2e-3, 0.9 * largest_time_step(body))
@@ -99,12 +99,12 @@ def make_workload(
 
 
 def make_body(kind: str, side: int) -> Body:
-    """A body to measure with.
+    """A body for measurements.
 
     Args:
         kind: "rope", "cloth", or "unstructured": the cloth with its particles in random order,
-            as the springs of a triangle mesh come.
-        side: particles along the rope or along a side of the cloth.
+            like the springs of a triangle mesh.
+        side: number of particles along the rope or along a side of the cloth.
     """
     if kind == "rope":
         return rope(side)
@@ -133,13 +133,14 @@ def shuffled(body: Body, seed: int = 0) -> Body:
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """The springs of a body by the offset `j - i` of their ends; zero where there is none.
+    """The springs of a body by the offset `j - i` of their ends; entries without one are zero.
 
     Attributes:
-        offsets: distinct and ascending, shape (D,).
-        stiffness: of the spring from `i` to `i + offsets[d]`, shape (D, N), newtons per metre.
-        damping: shape (D, N), newton-seconds per metre.
-        rest_length: shape (D, N), metres.
+        offsets: distinct offsets, ascending, shape (D,).
+        stiffness: stiffness of the spring from `i` to `i + offsets[d]`, shape (D, N), newtons per
+            metre.
+        damping: damping coefficients, shape (D, N), newton-seconds per metre.
+        rest_length: rest lengths, shape (D, N), metres.
     """
 
     offsets: Int[np.ndarray, " D"]
@@ -162,10 +163,10 @@ def by_offset(body: Body) -> Offsets:
 
 
 def sorted_springs(body: Body) -> tuple[Int[np.ndarray, "S 2"], Float[np.ndarray, "S 3"]]:
-    """Ends of the springs in the order of the particles, for memory's sake, and their numbers.
+    """Ends of the springs, in the order of particles for memory locality, and their parameters.
 
-    The numbers are stiffness, newtons per metre, damping, newton-seconds per metre, and the force
-    stiffness * rest length, newtons.
+    The parameters are stiffness, newtons per metre, damping, newton-seconds per metre, and the
+    force stiffness * rest length, newtons.
     """
     order = np.lexsort(np.sort(body.springs, axis=1).T[::-1])
     numbers = (body.stiffness, body.damping, body.stiffness * body.rest_length)

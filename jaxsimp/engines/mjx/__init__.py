@@ -1,4 +1,4 @@
-"""MJX, MuJoCo in JAX: an oracle of our springs, and a slow engine for ropes and small cloths."""
+"""MJX, MuJoCo in JAX: a reference for our springs; a slow engine for ropes and small cloths."""
 
 from jaxsimp.engines.mjx.comparison import Disagreement, compare_with_mjx
 from jaxsimp.engines.mjx.engine import (

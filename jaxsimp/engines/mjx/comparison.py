@@ -1,4 +1,4 @@
-"""How far our dynamics are from MJX's, which computes the same springs by other code."""
+"""Differences between our dynamics and MJX, an independent implementation of the same springs."""
 
 from dataclasses import dataclass
 
@@ -23,12 +23,13 @@ from jaxsimp.engines.mjx.engine import MJXSimulation, make_mjx_simulation, mjx_t
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Largest differences between two engines, each over the largest value there is.
+    """Largest differences between two engines, each relative to the largest value.
 
     Attributes:
-        acceleration: in all states that the other engine came through.
-        position: of states after as many steps; over the largest distance from the start.
-        velocity: of states after as many steps.
+        acceleration: relative difference of accelerations, in all states of MJX's motion.
+        position: difference of positions after equally many steps, over the largest distance from
+            the start.
+        velocity: relative difference of velocities after equally many steps.
     """
 
     acceleration: float
@@ -45,17 +46,17 @@ def compare_with_mjx(
 ) -> Disagreement:
     """Move a body freely in our dynamics and in MJX, and compare.
 
-    Rounding of float32 is amplified by stiff springs: `jax.enable_x64(True)` tells it apart.
+    Stiff springs amplify the rounding of float32; `jax.enable_x64(True)` shows its part.
 
     Args:
-        body: what is simulated.
-        state: at the start, so high that it does not reach the table.
-        num_steps: time steps.
-        time_step: seconds, at most `jaxsimp.dynamics.largest_time_step(body)`.
+        body: body to simulate.
+        state: state at the start, high enough to stay off the table.
+        num_steps: number of time steps.
+        time_step: time step, seconds, at most `jaxsimp.dynamics.largest_time_step(body)`.
         gravity: downward acceleration, metres per second squared.
 
     Raises:
-        ValueError: if the body reaches the table, or is refused (see `make_mjx_simulation`).
+        ValueError: if the body reaches the table, or `make_mjx_simulation` raises.
     """
     ours = make_simulation(body, time_step, gravity)
     theirs = make_mjx_simulation(body, time_step, gravity)
@@ -72,7 +73,7 @@ def compare_with_mjx(
 def _compare(
     ours: Simulation, theirs: MJXSimulation, state: State, num_steps: int
 ) -> tuple[Float[Array, ""], list[Float[Array, ""]]]:
-    """The lowest height that MJX comes to, and what makes a `Disagreement`."""
+    """The lowest height in MJX's motion, and the fields of a `Disagreement`."""
     moved = _trajectory(ours, state, num_steps)
     other, accelerations = mjx_trajectory(theirs, state, num_steps)
     passed = jax.tree.map(
@@ -87,7 +88,7 @@ def _compare(
 
 
 def _accelerations(simulation: Simulation, state: State) -> Float[Array, "N 3"]:
-    """Ours, without table and pickers."""
+    """Our accelerations, without table and pickers."""
     position, velocity = pack(simulation, state)
     tensions = spring_tensions(simulation.springs, position, velocity)
     forces = jnp.stack(pull(simulation.springs, tensions, position), axis=1)

@@ -1,10 +1,10 @@
-"""MJX, MuJoCo in JAX, as an oracle of our dynamics and as an engine of the planner.
+"""MJX, MuJoCo in JAX, as a reference for our dynamics and as an engine of the planner.
 
-A body is what `tendon_spec` makes of it. MJX computes accelerations and takes the Euler steps; to
-carry out plans, our table and our pickers correct the velocities of each step, as they do in our
-own dynamics: MJX has contacts of its own, but each costs rows of a constraint solver, and
-their friction is not Coulomb's. So MJX checks springs, gravity, drag and integration; it is no
-second opinion on contact. Gradients are not promised.
+`tendon_spec` gives the model of a body. MJX computes accelerations and takes the Euler steps; to
+carry out plans, our table and our pickers correct the velocities of each step, as in our own
+dynamics: MJX has contacts of its own, but each costs rows of a constraint solver, and their
+friction is not Coulomb's. So MJX checks springs, gravity, drag and integration, but not contact.
+Gradients are not supported.
 """
 
 import contextlib
@@ -28,8 +28,9 @@ from jaxsimp.engines.springs import CHUNK_SIZE
 from jaxsimp.tasks import Task
 
 MOST_PARTICLES = 100
-"""Larger bodies are refused: a step costs as much as springs times particles. In plans on a CPU it
-takes about fifty times as long as our own for a rope of 11, a thousand times for a 9 x 9 cloth."""
+"""Largest number of particles: the cost of a step is in proportion to springs times particles. In
+plans on a CPU a step takes about 50 times as long as ours for a rope of 11 particles, 1000 times
+for a 9 x 9 cloth."""
 
 
 @partial(
@@ -39,11 +40,11 @@ takes about fifty times as long as our own for a rope of 11, a thousand times fo
 )
 @dataclass(frozen=True)
 class MJXSimulation:
-    """A body's physics in MJX, and what our table and pickers need to know of it.
+    """A body's physics in MJX, and in our dynamics for the table and the pickers.
 
     Attributes:
         model: a `mujoco.mjx.Model`.
-        data: a `mujoco.mjx.Data` to put states into.
+        data: a `mujoco.mjx.Data` that receives states.
         ours: the body's simulation in our dynamics, for our table and pickers.
     """
 
@@ -53,7 +54,7 @@ class MJXSimulation:
 
     @property
     def time_step(self) -> Float[Array, "..."]:
-        """Seconds."""
+        """Time step, seconds."""
         return self.model.opt.timestep
 
 
@@ -63,18 +64,18 @@ def make_mjx_simulation(
     """The simulation of a body in MJX.
 
     Args:
-        body: what is simulated.
-        time_step: seconds, at most `jaxsimp.dynamics.largest_time_step(body)`.
+        body: body to simulate.
+        time_step: time step, seconds, at most `jaxsimp.dynamics.largest_time_step(body)`.
         gravity: downward acceleration, metres per second squared.
 
     Raises:
         ValueError: if the body has more than `MOST_PARTICLES` particles, or
-            `jaxsimp.dynamics.make_simulation` refuses it.
+            `jaxsimp.dynamics.make_simulation` raises.
     """
     if body.num_particles > MOST_PARTICLES:
         raise ValueError(
             f"the {body.name} has {body.num_particles} particles; MJX takes at most "
-            f"{MOST_PARTICLES}, for its steps are slow. Take fewer particles, or our own "
+            f"{MOST_PARTICLES}, as its steps are slow. Take fewer particles, or our own "
             f"dynamics"
         )
     ours = make_simulation(body, time_step, gravity)
@@ -108,8 +109,8 @@ def mjx_trajectory(
     """Motion by MJX alone, without table and pickers.
 
     Returns:
-        States after each of `num_steps` steps, and the accelerations that led there, stacked
-        along a first axis.
+        States after each of `num_steps` steps, and the accelerations in those steps, stacked along
+        a first axis.
     """
 
     def one(state: State, _: None) -> tuple[State, tuple[State, Float[Array, "N 3"]]]:
@@ -126,7 +127,7 @@ def mjx_rollout(
     actions: Actions,
     observe: Observe = lambda state, action: state.position,
 ) -> tuple[State, PyTree[Any]]:
-    """Carry out a plan in MJX: arguments and result as of `SearchEngine.rollout`."""
+    """Carry out a plan in MJX; arguments and result are those of `SearchEngine.rollout`."""
 
     def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:
         ours = simulation.ours
@@ -148,7 +149,7 @@ def _step(
     held: Bool[Array, " N"],
     carried: Float[Array, "N 3"],
 ) -> State:
-    """A step of MJX with velocities after contact; held particles have those of `carried`."""
+    """A step of MJX, with velocities after contact; held particles have the velocity `carried`."""
     free = _free_step(simulation, state)[0].velocity
     touched = table_contact(simulation.ours, state.position[:, 2], list(free.T))
     velocity = jnp.where(held[:, None], carried, jnp.stack(touched, axis=1))
@@ -172,7 +173,7 @@ def _loaded(simulation: MJXSimulation, state: State) -> Any:
 @cache
 def _mjx() -> Any:
     """The module `mujoco.mjx`."""
-    # It prints which of its parts cannot be had here; standard output is our caller's.
+    # The import prints MJX's unavailable parts; keep them off the caller's standard output.
     with contextlib.redirect_stdout(io.StringIO()):
         from mujoco import mjx
     return mjx
@@ -182,8 +183,8 @@ def _mjx() -> Any:
 class MJX:
     """MJX as the engine of a planner: `Planner(task, engine=MJX())`.
 
-    For ropes and small cloths, with patience: bodies of more than `MOST_PARTICLES` are refused.
-    They pass through themselves: MJX has no flexible bodies.
+    For ropes and small cloths, of at most `MOST_PARTICLES` particles, and slow. Bodies pass through
+    themselves: MJX has no flexible bodies.
     """
 
     def physics(self, task: Task) -> tuple[MJXSimulation, Pickers]:
@@ -209,7 +210,7 @@ class MJX:
         return costs
 
     def chunk_size(self, physics: tuple[MJXSimulation, Pickers]) -> int:
-        """As of mass-springs: not measured."""
+        """The chunk size of our mass-springs; not measured for MJX."""
         return CHUNK_SIZE
 
     def executor(self, task: Task) -> Executor:

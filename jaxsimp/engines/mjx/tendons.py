@@ -1,4 +1,4 @@
-"""A body as MuJoCo knows it: point masses on slide joints, joined by spatial tendons."""
+"""A body as a MuJoCo model: point masses on slide joints, joined by spatial tendons."""
 
 from typing import Any
 
@@ -13,17 +13,18 @@ def tendon_spec(body: Body, time_step: float = 2e-3, gravity: float = 9.81) -> A
     - A particle is a body on three slide joints along x, y and z, whose coordinates are its
       position in the world: `qpos` is the (N, 3) positions, row by row, and `qvel` velocities.
     - A spring is a spatial tendon from particle to particle with its stiffness, damping and rest
-      length. Its force is ours, but for ends closer than a thousandth of the shortest spring.
+      length. Its force is ours, except where its ends are closer than a thousandth of the shortest
+      spring.
     - Drag is joint damping of `drag * mass`. MuJoCo's Euler method takes joint damping
       implicitly, ours explicitly, so its flag `eulerdamp` is off; damping of tendons it takes
       explicitly, as we do. Both then take the same semi-implicit Euler step.
-    - Nothing touches: there are no geoms, and contacts are off.
+    - There is no contact: the model has no geoms, and contacts are off.
 
     `compile()` makes a model of it, `to_xml()` the text (of 6 digits) that MuJoCo's viewer opens.
 
     Args:
-        body: what is simulated.
-        time_step: seconds.
+        body: body to simulate.
+        time_step: time step, seconds.
         gravity: downward acceleration, metres per second squared.
     """
     import mujoco
@@ -53,7 +54,7 @@ def _add_particle(spec: Any, body: Body, particle: int) -> None:
         pos=position,
         mass=mass,
         ipos=[0.0, 0.0, 0.0],
-        # A ball's. MuJoCo wants one, although nothing turns.
+        # The inertia of a ball. MuJoCo needs one, although nothing turns.
         inertia=[0.4 * mass * size**2] * 3,
         explicitinertial=True,  # in XML, too
     )

@@ -1,4 +1,4 @@
-"""MuJoCo: bodies as its flexible bodies, and plans carried out in it."""
+"""MuJoCo: models of bodies as its flexible bodies, and execution of plans."""
 
 from jaxsimp.engines.mujoco.execution import MuJoCo, replay
 from jaxsimp.engines.mujoco.model import VARIANTS, Variant, make_model, save_mjcf

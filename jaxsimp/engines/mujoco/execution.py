@@ -1,9 +1,9 @@
-"""Plans carried out in MuJoCo: the same limits, stretch rule and speed profile as in ours.
+"""Execution of plans in MuJoCo: the same limits, stretch rule and speed profile as in ours.
 
-What a picker may do is asked of `jaxsimp.dynamics.pickers.grasp`, with the positions that MuJoCo
-has at the start of each action; the particle that it holds is joined to a mocap body, which goes
-along the displacement. Plans run side by side on all cores, each in its own `mujoco.MjData`: a
-plan's result does not depend on the others.
+`jaxsimp.dynamics.pickers.grasp` decides the motion of the pickers, from MuJoCo's positions at the
+start of each action; the held particle is joined to a mocap body, which moves along the
+displacement. Plans run side by side on all cores, each in its own `mujoco.MjData`: the result of a
+plan does not depend on the others.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,31 +25,31 @@ from jaxsimp.machine import num_cores
 from jaxsimp.tasks import Episode, Task, score
 
 LEAD = 4
-"""A mocap body has no velocity, so that the constraint brakes what it holds. With the constraint of
-model.py (critically damped, its time constant two steps) a particle is, after a step of its path,
-just where it should be when the mocap body was four such steps ahead of it."""
+"""Lead of the mocap body, in time steps. A mocap body has no velocity, so the constraint brakes the
+held particle. With the constraint of model.py (critically damped, a time constant of two steps) the
+particle is exactly on its path if the mocap body is four steps ahead of it."""
 FASTEST = 100.0
-"""Metres per second along an axis: no picker, spring or fall makes a particle this fast."""
+"""Speed along an axis, metres per second, that no picker, spring or fall gives a particle."""
 STILL, STILL_SECONDS = 5e-3, 0.1
 """A body has settled when no particle was faster than this along an axis, metres per second, for
-so long. A folded cloth then creeps on, by some 0.4 mm in the rest of the task's time."""
+this many seconds. A folded cloth then creeps by about 0.4 mm in the rest of the task's time."""
 
 
 @dataclass(frozen=True)
 class MuJoCo:
-    """MuJoCo as an engine: it evaluates plans, and cannot search.
+    """MuJoCo as an engine: it evaluates plans; a planner cannot search in it.
 
     Attributes:
-        variant: of the model, see `jaxsimp.engines.mujoco.model`.
+        variant: variant of the model, see `jaxsimp.engines.mujoco.model`.
     """
 
     variant: str | Variant = "full"
 
     def executor(self, task: Task) -> Executor:
-        """See `Engine.executor`; a model is compiled for each plan, with the particles it grasps.
+        """See `Engine.executor`; it compiles a model for each plan, with the plan's particles.
 
         Raises:
-            ValueError: if there is no such variant.
+            ValueError: if the variant is unknown.
         """
         variant = as_variant(self.variant)
 
@@ -70,19 +70,20 @@ def replay(
 ) -> Iterator[Execution]:
     """Carry out plans in MuJoCo, let the body settle, and score them.
 
-    Results come one by one, in the order of the plans; the first is begun when it is asked for,
-    and the others beside it.
+    Results come one by one, in the order of the plans; work on all plans begins when the caller
+    asks for the first result.
 
     Args:
-        task: what is asked; its body, limits and times are used.
+        task: the task; `replay` uses its body, limits and times.
         episodes: start and goal of each plan.
-        plans: of any numbers of actions.
-        variant: of the model, see `jaxsimp.engines.mujoco.model`.
-        num_workers: plans at a time; by default as many as there are cores. It changes no result.
+        plans: plans, of any numbers of actions.
+        variant: variant of the model, see `jaxsimp.engines.mujoco.model`.
+        num_workers: number of plans at a time, by default the number of cores. Results do not
+            depend on it.
 
     Raises:
-        ValueError: if there are not as many episodes as plans, a plan names a particle that the
-            body does not have, or there is no such variant.
+        ValueError: if the numbers of episodes and plans differ, a plan names a particle that the
+            body does not have, or the variant is unknown.
     """
     if len(episodes) != len(plans):
         raise ValueError(
@@ -128,7 +129,7 @@ def _replay_one(
 
 
 class _Scene:
-    """One simulation and what pickers do in it."""
+    """One simulation and the actions of pickers in it."""
 
     def __init__(self, task: Task, model: Any, start: Float[np.ndarray, "N 3"]) -> None:
         import mujoco
@@ -142,7 +143,7 @@ class _Scene:
         self.unstable = False
 
     def positions(self) -> Float[np.ndarray, "N 3"]:
-        """Of the particles, metres; not a number once the simulation is unstable."""
+        """Positions of the particles, metres; NaN once the simulation is unstable."""
         rest = self._task.body.rest
         if self.unstable:
             return np.full_like(rest, np.nan)
@@ -163,7 +164,7 @@ class _Scene:
             self._data.eq_active[constraint] = 0
 
     def settle(self, num_actions: int) -> None:
-        """Let the time of some actions pass with nothing held, or less where all comes to rest."""
+        """Step with nothing held for `num_actions` actions, or until the body is at rest."""
         enough, still = max(1, round(STILL_SECONDS / self._model.opt.timestep)), 0
         for _ in range(num_actions * self._steps):
             self._step()
@@ -186,7 +187,7 @@ class _Scene:
             return
         mujoco.mj_step(self._model, self._data)
         warned = any(self._data.warning.number[kind] for kind in _unstable_kinds())
-        # A solver that does not converge makes speeds that are finite, and nonsense.
+        # A solver that does not converge can give speeds that are finite but meaningless.
         self.unstable = warned or not np.abs(self._data.qvel).max() < FASTEST
 
     def _picker(self, particle: int) -> tuple[int, int]:
@@ -196,7 +197,7 @@ class _Scene:
 
 
 def _unstable_kinds() -> tuple[int, ...]:
-    """Warnings after which the numbers of a simulation mean nothing."""
+    """Warnings after which the numbers of a simulation are meaningless."""
     from mujoco import mjtWarning
 
     kinds = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)
@@ -206,7 +207,7 @@ def _unstable_kinds() -> tuple[int, ...]:
 def _grasp(
     task: Task, pickers: Pickers, position: np.ndarray, pick: np.ndarray, displacement: np.ndarray
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
-    """Which particles an action holds, and where it carries each."""
+    """Held particles of an action, and the displacement of each."""
     action = Actions(jnp.asarray(pick), jnp.asarray(displacement, dtype=float))
     rest, floor = jnp.asarray(task.body.rest, float), jnp.asarray(task.body.radius, float)
     held, moves = _jitted_grasp(pickers, rest, floor, jnp.asarray(position, float), action)

@@ -1,17 +1,18 @@
 """Bodies as flexible bodies of MuJoCo: the same sheet or rope in a reference engine.
 
 A particle becomes a body on three slide joints, so `qpos = position - rest` loads any of our
-states. What corresponds and how:
+states. The correspondence:
 
 - **mass, air drag, friction, radius**: the same numbers. Drag is that of the air on small cubes.
-- **stretch**: a sheet of springs is, averaged over directions, an elastic membrane, and a rope of
-  springs one along its segments (see `stretch_stiffness`). So is its damping.
-- **bending**: our bend springs resist with the fourth power of the angle, a rod and a plate
-  with its square. Their energies are made equal at a turn of one radian (see
+- **stretch**: a sheet of springs is, averaged over directions, an elastic membrane; a rope of
+  springs is one spring along each segment (see `stretch_stiffness`). The same holds for damping.
+- **bending**: the energy of our bend springs grows with the fourth power of the angle, that of a
+  rod or a plate with its square. The energies are equal at a turn of one radian (see
   `bending_rigidity`).
 
-The "full" variant has all that, and collides with itself. The "fast" one hardly stretches (its
-edges are soft constraints), is limp, and passes through itself. MuJoCo is imported when called.
+The "full" variant has all of these, and self-collision. The "fast" variant hardly stretches (its
+edges are soft constraints), has no bending stiffness, and passes through itself. MuJoCo is
+imported when called.
 """
 
 from collections.abc import Iterable
@@ -28,21 +29,22 @@ from jaxsimp.bodies.topology import are_among, chain, half_edges
 from jaxsimp.dynamics import largest_time_step
 
 POISSON = 1 / 3
-"""Of every isotropic sheet of springs: their forces are central."""
+"""Poisson's ratio of every isotropic sheet of springs, as their forces are central."""
 GRAVITY = 9.81
 SIDE = 0.01
-"""Of the cube that stands for a particle of mean mass in the air, metres."""
+"""Side of the cube that represents a particle of mean mass in the air, metres."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What of a body is modelled.
+    """Modelled properties of a body.
 
     Attributes:
-        time_step: seconds; an elastic rope, whose springs are integrated explicitly, takes at
-            most a quarter of the largest stable one.
-        elastic: stretches and resists bending as our springs do; or does neither.
-        self_collision: layers and strands touch, with friction.
+        time_step: time step, seconds; an elastic rope, whose springs are integrated explicitly,
+            takes at most a quarter of the largest stable one.
+        elastic: whether the body stretches and resists bending as our springs do; it does neither
+            otherwise.
+        self_collision: whether layers and strands touch, with friction.
     """
 
     time_step: float
@@ -61,10 +63,10 @@ VARIANTS = {
 
 
 def as_variant(variant: str | Variant) -> Variant:
-    """A variant by its name, or as it is.
+    """A variant from its name; a `Variant` is returned unchanged.
 
     Raises:
-        ValueError: if there is no such name.
+        ValueError: if the name is unknown.
     """
     if isinstance(variant, Variant):
         return variant
@@ -74,28 +76,29 @@ def as_variant(variant: str | Variant) -> Variant:
 
 
 def stretch_stiffness(body: Body, weight: Float[np.ndarray, " S"]) -> float:
-    """Of the rope, N, or sheet, N/m, that the springs stand for: force over strain, a width.
+    """Stretch stiffness of the equivalent rope, N (force over strain), or sheet, N/m (per width).
 
     A spring of stiffness `k` and length `L` along `n` adds `k L^2 n n n n` over the area to the
-    tensor of a sheet of springs. Averaged over directions that is an isotropic sheet of Poisson's
-    ratio 1/3, and its Young's modulus times thickness is a third of the trace,
-    `sum k L^2 / (3 area)`. For a rope it is `sum k L^2 / length`.
+    stiffness tensor of a sheet of springs. Averaged over directions, the sheet is isotropic with
+    Poisson's ratio 1/3, and its Young's modulus times thickness is a third of the trace,
+    `sum k L^2 / (3 area)`. For a rope the stiffness is `sum k L^2 / length`.
 
     Args:
-        body: of particles along a line, or with triangles.
-        weight: of the springs: their stiffness, or their damping for how it resists rates.
+        body: body of particles along a line, or with triangles.
+        weight: stiffness of the springs, or their damping, for the damping of stretch.
     """
     total = float(np.sum(weight * body.rest_length**2))
     return total / (3 * _area(body) if len(body.faces) else _length(body))
 
 
 def bending_rigidity(body: Body) -> float:
-    """Rigidity of the rod, N m^2, or plate, N m, that the bend springs stand for.
+    """Bending rigidity of the rod, N m^2, or plate, N m, equivalent to the bend springs.
 
-    A spring of length `L` across a turn `a` in its middle is shortened by `L a^2 / 8`, and has
-    the energy `k L^2 a^4 / 128`; where curvature is `2 a / L`, a rod of rigidity `D` has
-    `2 D a^2 / L^2` a length. Equal at `a = 1` for `D = sum k L^4 / (256 length)`. Over a sheet,
-    a spring at an angle to the curvature feels `cos^8` of it, 35/128 in the mean.
+    A turn `a` in the middle of a spring of length `L` shortens it by `L a^2 / 8`, with the energy
+    `k L^2 a^4 / 128`; at the curvature `2 a / L`, a rod of rigidity `D` has the energy
+    `2 D a^2 / L^2` per length. The two are equal at `a = 1` for `D = sum k L^4 / (256 length)`.
+    In a sheet, the energy of a spring at an angle to the curvature has the factor `cos^8` of the
+    angle, 35/128 on average.
     """
     # Springs that are edges of the flex do not resist bending.
     edges = half_edges(body.faces)[0] if len(body.faces) else chain(body.num_particles)
@@ -114,14 +117,14 @@ def make_model(
     """A body as a compiled `mujoco.MjModel`.
 
     Args:
-        body: of particles along a line, or with triangles.
-        variant: its name, or what it models.
-        graspable: particles that can be grasped: each has a mocap body `picker_<particle>` and
-            an inactive `connect` constraint of that name.
-        table: whether there is one.
+        body: body of particles along a line, or with triangles.
+        variant: name of a variant, or a `Variant`.
+        graspable: ids of particles that pickers can grasp: each has a mocap body
+            `picker_<particle>` and an inactive `connect` constraint of that name.
+        table: whether the model has a table.
 
     Raises:
-        ValueError: if there is no such variant or particle.
+        ValueError: if the variant or a particle does not exist.
     """
     return _spec(body, as_variant(variant), graspable, table).compile()
 
@@ -136,11 +139,11 @@ def save_mjcf(
     """Write a body as MJCF: `python -m mujoco.viewer --mjcf=PATH` opens it.
 
     Args:
-        path: of the file.
+        path: path of the file.
         body: as for `make_model`.
         variant: as for `make_model`.
         graspable: as for `make_model`.
-        position: of a keyframe named "start", shape (N, 3), metres.
+        position: positions in a keyframe named "start", shape (N, 3), metres.
 
     Raises:
         ValueError: as for `make_model`.
@@ -175,7 +178,7 @@ def _spec(body: Body, variant: Variant, graspable: Iterable[int], table: bool) -
     if variant.elastic:
         (_set_sheet if len(body.faces) else _set_rope)(flex, body)
     else:
-        # With MuJoCo's impedance: a stiffer one does not converge where edges are many.
+        # MuJoCo's default impedance: a stiffer one does not converge with many edges.
         solref = _stiffest(spec.option.timestep)
         spec.add_equality(type=mujoco.mjtEq.mjEQ_FLEX, name1="body", solref=solref)
     if table:
@@ -198,7 +201,7 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
     import mujoco
 
     option = spec.option
-    # A cube of side s in air of this viscosity feels the force 3 pi s viscosity v.
+    # The drag force on a cube of side s in air of this viscosity is 3 pi s viscosity v.
     option.viscosity = body.material.drag * float(body.mass.mean()) / (3 * np.pi * SIDE)
     option.gravity = [0.0, 0.0, -GRAVITY]
     option.timestep = variant.time_step
@@ -206,12 +209,12 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     if len(body.faces):
         # Newton's method, the default, is exact, and ten times slower with the thousands of
-        # contacts of layers. Folds of these iterations end 0.1 and 0.7 mm RMS (side, diagonal)
-        # from those of up to a thousand, solved to 1e-9.
+        # contacts of layers. With these iterations the side and the diagonal fold end 0.1 and
+        # 0.7 mm RMS from those with up to a thousand iterations, solved to 1e-9.
         option.solver = mujoco.mjtSolver.mjSOL_CG
         option.tolerance = 1e-6
         option.iterations = 100
-    # What has become unstable must not be reset to a state that looks normal.
+    # Do not reset an unstable simulation to a state that looks normal.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if variant.elastic and len(body.faces):
         option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
@@ -222,7 +225,7 @@ def _set_options(spec: Any, body: Body, variant: Variant) -> None:
 def _add_particle(
     spec: Any, name: str, place: Float[np.ndarray, "3"], mass: float, side: float
 ) -> None:
-    """A point mass on three slide joints; to the air it is a cube."""
+    """Add a point mass on three slide joints, with the air drag of a cube."""
     import mujoco
 
     inertia = [mass * side**2 / 6] * 3
@@ -234,7 +237,7 @@ def _add_particle(
 
 
 def _set_elements(flex: Any, body: Body, variant: Variant) -> None:
-    """Triangles of a sheet or segments of a rope, and how they touch each other."""
+    """Set the triangles of a sheet or segments of a rope, and their contacts."""
     import mujoco
 
     kind = mujoco.mjtFlexSelf
@@ -244,7 +247,7 @@ def _set_elements(flex: Any, body: Body, variant: Variant) -> None:
 
 
 def _set_sheet(flex: Any, body: Body) -> None:
-    """Elasticity of a sheet: the thickness is the one that gives both rigidities."""
+    """Set the elasticity of a sheet: one thickness gives both stretch and bending stiffness."""
     stretch = stretch_stiffness(body, body.stiffness)
     thickness = np.sqrt(12 * (1 - POISSON**2) * bending_rigidity(body) / stretch)
     flex.young, flex.poisson, flex.thickness = stretch / thickness, POISSON, thickness
@@ -253,7 +256,7 @@ def _set_sheet(flex: Any, body: Body) -> None:
 
 
 def _set_rope(flex: Any, body: Body) -> None:
-    """Elasticity of a rope: springs along its segments, and bending of a round rod."""
+    """Set the elasticity of a rope: springs along its segments, and bending of a round rod."""
     segment = _length(body) / (body.num_particles - 1)
     flex.edgestiffness = stretch_stiffness(body, body.stiffness) / segment
     flex.edgedamping = stretch_stiffness(body, body.damping) / segment
@@ -261,7 +264,7 @@ def _set_rope(flex: Any, body: Body) -> None:
 
 
 def _add_picker(spec: Any, body: Body, particle: int) -> None:
-    """What grasps a particle: a mocap body, joined to it when the constraint is switched on."""
+    """Add a picker of one particle: a mocap body, joined to it by a switchable constraint."""
     import mujoco
 
     if not 0 <= particle < body.num_particles:
@@ -278,8 +281,8 @@ def _add_picker(spec: Any, body: Body, particle: int) -> None:
         name1=f"particle_{particle}",
         name2=name,
         active=False,
-        data=[0.0] * mujoco.mjNEQDATA,  # at no offset: both are made where the particle rests
-        # As stiff as the time step allows: what is held follows its picker within 0.1 mm.
+        data=[0.0] * mujoco.mjNEQDATA,  # no offset: both start where the particle rests
+        # As stiff as the time step allows: a held particle follows its picker within 0.1 mm.
         solref=_stiffest(spec.option.timestep),
         solimp=[0.999, 0.9999, 1e-4, 0.5, 2.0],
     )
@@ -288,16 +291,16 @@ def _add_picker(spec: Any, body: Body, particle: int) -> None:
 def _stiffest(time_step: float) -> list[float]:
     """Time constant, s, and damping ratio of a constraint as stiff as the time step allows.
 
-    Our contacts are rigid. A critically damped one of time constant `c` gives way by `v c / e` to
-    what hits it at a speed `v`: at 1 m/s and MuJoCo's own 20 ms by 7 mm. A layer that was laid
-    down on another, of a thickness of 4 mm, went through it at 0.3 m/s already, but not at 1.4 m/s
-    with 4 ms. What friction holds under a load creeps in proportion to `c`, too.
+    Our contacts are rigid. A critically damped contact of time constant `c` yields by `v c / e` to
+    an impact at speed `v`: by 7 mm at 1 m/s and MuJoCo's default of 20 ms. With that default, a
+    layer laid on another, 4 mm thick, tunnelled through it at 0.3 m/s; with 4 ms it did not at
+    1.4 m/s. The creep of particles that friction holds under a load is in proportion to `c`, too.
     """
     return [2 * time_step, 1.0]
 
 
 def _contact_radius(body: Body, variant: Variant) -> float:
-    """The body's radius, or less where parts that are not neighbours would always touch."""
+    """The body's radius, or less if parts that are not neighbours would always touch."""
     return min(body.radius, 0.45 * body.spacing) if variant.self_collision else body.radius
 
 
@@ -306,5 +309,5 @@ def _area(body: Body) -> float:
 
 
 def _length(body: Body) -> float:
-    """Of a rope along its segments, metres."""
+    """Length of a rope along its segments, metres."""
     return float(np.linalg.norm(np.diff(body.rest, axis=0), axis=1).sum())
