@@ -303,16 +303,6 @@ for (left, middle_axes, right), (name, (body, *_)) in zip(rows, cases.items(), s
 
     wanted = np.stack([recording.positions for recording in unseen[name]])
     moments = action_seconds * np.arange(1, num_actions + 1)
-    for label, each, style in [("before", body, "C1"), ("after", found[name].body, "C0")]:
-        replayed = simulate_recordings(
-            each, unseen[name], action_seconds, longest_time_step=longest
-        )
-        missed = replayed - wanted
-        by_moment = np.sqrt((missed**2).sum(axis=-1).mean(axis=(0, 2)))
-        middle_axes.plot(moments, 1e3 * by_moment, style, label=label)
-    middle_axes.set(xlabel="time (s)", ylabel="RMS error (mm)", title=f"{name}: not seen")
-    middle_axes.legend(frameon=False)
-
     # The rope, or the middle row of the cloth, at the last moment.
     axis, shown = 0, slice(None)
     if name == "cloth":
@@ -321,9 +311,14 @@ for (left, middle_axes, right), (name, (body, *_)) in zip(rows, cases.items(), s
     right.plot(*1e3 * points[:, [axis, 2]].T, "k--", label="MuJoCo")
     for label, each, style in [("before", body, "C1"), ("after", found[name].body, "C0")]:
         replayed = simulate_recordings(
-            each, unseen[name][:1], action_seconds, longest_time_step=longest
+            each, unseen[name], action_seconds, longest_time_step=longest
         )
+        missed = replayed - wanted
+        by_moment = np.sqrt((missed**2).sum(axis=-1).mean(axis=(0, 2)))
+        middle_axes.plot(moments, 1e3 * by_moment, style, label=label)
         right.plot(*1e3 * replayed[0, -1, shown][:, [axis, 2]].T, style, label=label)
+    middle_axes.set(xlabel="time (s)", ylabel="RMS error (mm)", title=f"{name}: not seen")
+    middle_axes.legend(frameon=False)
     right.set(xlabel=f"{'xy'[axis]} (mm)", ylabel="z (mm)", title=f"{name}: last moment, cut")
     right.legend(frameon=False)
 plt.show()
