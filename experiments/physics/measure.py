@@ -31,7 +31,7 @@ def hang(body: Body, start: Positions, held: Sequence[int], seconds: float) -> P
     simulation = make_simulation(body, time_step, GRAVITY)
     motion = Motion(jnp.asarray(np.isin(np.arange(len(start)), held)), jnp.zeros((3, len(start))))
     shares = jnp.zeros(round(seconds / time_step))
-    final = _steps(simulation, pack(simulation, at_rest(start)), motion, shares)
+    final, _ = _steps(simulation, (pack(simulation, at_rest(start)), None), motion, shares)
     return np.asarray(unpack(simulation, final).position, dtype=float)
 
 

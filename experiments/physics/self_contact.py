@@ -58,8 +58,7 @@ def folded_twice(
         picks[:4, 0] = picked
         actions = Actions(jnp.asarray(picks), jnp.asarray(moves, dtype=float))
         state, _ = run(simulation, pickers, state, actions, adjoint=False)
-    missed = 0 if state.missed is None else int(state.missed)
-    return np.asarray(state.position, dtype=float), missed
+    return np.asarray(state.position, dtype=float), int(state.missed)
 
 
 def over(way: Float[np.ndarray, "3"], lift: float, gap: float) -> Float[np.ndarray, "4 3"]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from jaxsimp.dynamics.adjoint import plain_steps, steps
-from jaxsimp.dynamics.contact.stepping import Moving, begin, end, touching_steps
+from jaxsimp.dynamics.contact.stepping import Moving, begin, end
 from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, speed_profile
 from jaxsimp.dynamics.simulation import Simulation, State
 from jaxsimp.dynamics.step import Motion, unpack
@@ -57,13 +57,13 @@ def rollout_observing(
     adjoint: bool = True,
 ) -> tuple[State, PyTree[Any]]:
     """`rollout`, but `observe` takes the state at the end of each action, and the action."""
-    advance = steps if adjoint else plain_steps
+    run = steps if adjoint else plain_steps
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
         position = unpack(simulation, moving[0]).position
         held, displacement = grasp(pickers, simulation.rest, simulation.radius, position, action)
         motion = Motion(held, displacement.T / simulation.time_step)
-        moving = touching_steps(advance, simulation, moving, motion, speed_profile(pickers.steps))
+        moving = run(simulation, moving, motion, speed_profile(pickers.steps))
         return moving, observe(end(simulation, moving), action)
 
     moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
@@ -76,5 +76,5 @@ def settle(simulation: Simulation, state: State, num_steps: int) -> State:
     held = jnp.zeros(len(state.position), dtype=bool)
     drive = jnp.zeros_like(state.position.T)
     share = jnp.zeros(num_steps, dtype=drive.dtype)
-    moving = touching_steps(steps, simulation, moving, Motion(held, drive), share)
+    moving = steps(simulation, moving, Motion(held, drive), share)
     return end(simulation, moving)

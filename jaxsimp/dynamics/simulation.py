@@ -1,12 +1,12 @@
 """Simulations: the physics of a body as arrays, with a time step proven stable."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsimp.bodies import Body
 from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_contact
@@ -30,12 +30,13 @@ class State:
     Attributes:
         position: positions, shape (N, 3), metres.
         velocity: velocities, shape (N, 3), metres per second.
-        missed: tunnelled contacts so far, see `Contacts`; None without self-contact.
+        missed: number of tunnelled contacts so far, see `Contacts`; 0 without self-contact. A
+            float, so that states can be differentiated.
     """
 
     position: Float[Array, "... N 3"]
     velocity: Float[Array, "... N 3"]
-    missed: Int[Array, "..."] | None = None
+    missed: Float[Array, "..."] = field(default_factory=lambda: jnp.zeros(()))
 
 
 @partial(

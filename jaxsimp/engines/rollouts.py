@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxsimp.dynamics import NONE, Actions, State, at_rest
 from jaxsimp.engines.engine import Execution, ExecutionStatus, SearchEngine, then_idle
@@ -82,11 +82,10 @@ class RolloutExecutor:
             )
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
         shared = (self._physics, as_float(episode))
-        (positions,), (value,), missed = self._compiled(shared, one)
+        (positions,), (value,), (missed,) = self._compiled(shared, one)
         fine = bool(np.isfinite(positions).all() and np.isfinite(value))
         status = ExecutionStatus.FINE if fine else ExecutionStatus.UNSTABLE
-        count = None if missed is None else int(missed[0])
-        return Execution(positions, float(value), status, missed=count)
+        return Execution(positions, float(value), status, missed=int(missed))
 
     @cached_property
     def _compiled(self) -> PopulationMap:
@@ -99,7 +98,7 @@ class RolloutExecutor:
 
 def _execute(
     task: Task, engine: SearchEngine, shared: tuple[PyTree[Any], Episode], actions: Actions
-) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""], Int[Array, ""] | None]:
+) -> tuple[Float[Array, "T2 N 3"], Float[Array, ""], Float[Array, ""]]:
     """Positions at the start, after each action and settled; score of the last; and `missed`."""
     physics, episode = shared
     start = at_rest(episode.start)

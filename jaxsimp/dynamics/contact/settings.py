@@ -15,14 +15,16 @@ from jaxsimp.bodies.topology import connected_pieces, half_edges, neighbours
 
 TOP_SPEED = 2.1
 """Default of the fastest that pickers may move, metres per second."""
+LEVEL = 0.3
+"""Layers closer than this, as a fraction of the thickness, count as side by side."""
+SEARCH = 1.5
+"""Search radius, as a multiple of the distance up to which pairs are listed."""
 SPARE = 1.05
 """Times the thickness that layers are held apart: what presses them pushes them in a little."""
-INTERVAL = 1
-"""Default of the time steps from contact to contact."""
 AHEAD = 1
-"""Intervals for which is looked ahead: the farther, the more is found, and the longer it lasts."""
+"""Look-ahead, in time steps: with more, lookups list more pairs, and their lists last longer."""
 MOST_LAYERS_OF_SHEETS = 1.1
-"""Thicknesses that a picker may move in an interval."""
+"""Longest move of a picker in a time step, in thicknesses."""
 MOST_LAYERS_OF_ROPES = 0.75
 """The same for ropes: struck faster, they stretch until their gaps let others through."""
 
@@ -40,7 +42,7 @@ MOST_LAYERS_OF_ROPES = 0.75
         "squash",
         "friction",
     ],
-    meta_fields=["is_sheet", "interval"],
+    meta_fields=["is_sheet"],
 )
 @dataclass(frozen=True)
 class SelfContact:
@@ -58,8 +60,7 @@ class SelfContact:
         squash: weight that the squared distance across a sheet has on top of 1, where the nearest
             particle is looked for: `|d|^2 + squash across^2`.
         friction: Coulomb coefficient between layers.
-        is_sheet: or else a rope, static.
-        interval: time steps from contact to contact, static.
+        is_sheet: whether the body is a sheet, or else a rope; static.
     """
 
     frame: Int[Array, "... 4 N"]
@@ -72,7 +73,6 @@ class SelfContact:
     squash: Float[Array, "..."]
     friction: Float[Array, "..."]
     is_sheet: bool
-    interval: int
 
 
 def make_self_contact(
@@ -81,7 +81,6 @@ def make_self_contact(
     *,
     top_speed: float = TOP_SPEED,
     friction: float | None = None,
-    interval: int = INTERVAL,
 ) -> SelfContact:
     """How a body touches itself.
 
@@ -90,7 +89,6 @@ def make_self_contact(
         time_step: of the simulation, seconds.
         top_speed: fastest that a picker moves, metres per second.
         friction: Coulomb coefficient between layers; by default that with the table.
-        interval: time steps from contact to contact.
 
     Raises:
         ValueError: if the body has no thickness, pickers are too fast for it, or a number is out
@@ -101,21 +99,18 @@ def make_self_contact(
         raise ValueError(
             "thickness is 0; self-contact holds layers that far apart: give metres above zero"
         )
-    if interval < 1:
-        raise ValueError(f"interval is {interval}; contact acts after at least 1 time step")
     friction = body.material.friction if friction is None else friction
     if not 0 <= friction < np.inf:
         raise ValueError(f"friction is {friction}; give a finite number, zero or more")
-    seconds = interval * time_step
     is_sheet = len(body.faces) > 0
     layers = MOST_LAYERS_OF_SHEETS if is_sheet else MOST_LAYERS_OF_ROPES
-    fastest = layers * thickness / seconds
+    fastest = layers * thickness / time_step
     if not 0 < top_speed <= fastest:
         raise ValueError(
             f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "
-            f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s when contact "
-            f"acts every {1e3 * seconds:.3g} ms. Take smaller limits, longer actions, a "
-            f"smaller time step or interval, or a larger thickness; or leave self-contact out"
+            f"reliably at speeds above 0 and up to {fastest * (1 - 5e-4):.4g} m/s at time steps "
+            f"of {1e3 * time_step:.3g} ms. Take smaller limits, longer actions, a smaller time "
+            f"step, or a larger thickness; or leave self-contact out"
         )
     covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.
@@ -130,12 +125,11 @@ def make_self_contact(
         adjacent=array(max(1.25 * body.rest_length.max(), 2 * thickness)),
         thickness=array(SPARE * thickness),
         lateral=array(1.2 * covering),
-        margin=array(AHEAD * top_speed * seconds),
+        margin=array(AHEAD * top_speed * time_step),
         slack=array(0.25 * covering),
         squash=array(stretch - 1),
         friction=array(friction),
         is_sheet=is_sheet,
-        interval=interval,
     )
 
 

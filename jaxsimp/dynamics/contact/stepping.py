@@ -1,20 +1,17 @@
-"""Time steps of a body that touches itself: plain steps, and contact between them."""
+"""One time step of a body that may touch itself."""
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsimp.dynamics.contact.layers import Contacts, find_contacts, touch
+from jaxsimp.dynamics.contact.contacts import Contacts
+from jaxsimp.dynamics.contact.layers import find_contacts, touch, touch_vjp
 from jaxsimp.dynamics.simulation import Simulation, State
-from jaxsimp.dynamics.step import Motion, Packed, pack, unpack
+from jaxsimp.dynamics.step import Axes, Motion, Packed, pack, step_and_free, unpack
 
-PASSES = 2
-"""Over all contacts, in an interval: after one, layers pressed hard are up to a third too close."""
-Advance = Callable[[Simulation, Packed, Motion, Float[Array, " S"]], Packed]
-"""Time steps without self-contact, see adjoint.py."""
 Moving = tuple[Packed, Contacts | None]
 """A state as the steps want it, and its contacts, None without self-contact."""
 
@@ -22,10 +19,7 @@ Moving = tuple[Packed, Contacts | None]
 def begin(simulation: Simulation, state: State) -> Moving:
     """A state made ready to be stepped."""
     packed, settings = pack(simulation, state), simulation.self_contact
-    if settings is None:
-        return packed, None
-    missed = jnp.zeros((), jnp.int32) if state.missed is None else state.missed
-    return packed, find_contacts(settings, packed[0], missed)
+    return packed, None if settings is None else find_contacts(settings, packed[0], state.missed)
 
 
 def end(simulation: Simulation, moving: Moving) -> State:
@@ -35,39 +29,68 @@ def end(simulation: Simulation, moving: Moving) -> State:
     return state if contacts is None else replace(state, missed=contacts.missed)
 
 
-def touching_steps(
-    advance: Advance,
-    simulation: Simulation,
-    moving: Moving,
-    motion: Motion,
-    shares: Float[Array, " S"],
+def advance(
+    simulation: Simulation, moving: Moving, motion: Motion, share: Float[Array, ""]
 ) -> Moving:
-    """Time steps; with self-contact, in runs of `interval` or fewer with contact after each."""
-    packed, _ = moving
-    settings, plain = simulation.self_contact, replace(simulation, self_contact=None)
-    if settings is None:
-        return advance(simulation, packed, motion, shares), None
-
-    def run(moving: Moving, shares: Float[Array, " S"]) -> tuple[Moving, None]:
-        packed, contacts = moving
-        return _touch(simulation, motion, advance(plain, packed, motion, shares), contacts), None
-
-    whole = len(shares) // settings.interval
-    runs, rest = jnp.split(shares, [whole * settings.interval])
-    moving, _ = jax.lax.scan(run, moving, runs.reshape(whole, settings.interval))
-    return run(moving, rest)[0] if len(rest) else moving
+    """One time step: springs, table and pickers, then self-contact."""
+    packed, contacts = moving
+    plain = replace(simulation, self_contact=None)
+    packed, _ = step_and_free(plain, packed, motion, share)
+    return (
+        (packed, None) if contacts is None else touch_step(simulation, packed, motion, contacts)[0]
+    )
 
 
-def _touch(
-    simulation: Simulation, motion: Motion, packed: Packed, contacts: Contacts | None
-) -> Moving:
-    """Contact, and contacts that are good until it acts again."""
+class Touch(NamedTuple):
+    """Self-contact in one time step, as its adjoint needs it.
+
+    Attributes:
+        moved: state before it.
+        before: fields of the contacts before it.
+        touched: positions after it.
+        after: fields of the contacts after it.
+    """
+
+    moved: Packed
+    before: list[Any]
+    touched: Float[Array, "3 NHH"]
+    after: list[Any]
+
+
+def touch_step(
+    simulation: Simulation, packed: Packed, motion: Motion, contacts: Contacts
+) -> tuple[Moving, Touch]:
+    """Self-contact after a time step."""
     settings = simulation.self_contact
     assert settings is not None
-    assert contacts is not None
-    seconds = settings.interval * simulation.time_step
-    inverse_mass = jnp.where(motion.held, 0.0, 1.0 / simulation.mass)
-    contacts, position, velocity = touch(
-        settings, contacts, inverse_mass, simulation.radius, seconds, *packed, passes=PASSES
+    around = _around(simulation, motion)
+    position, velocity, after = touch(settings, contacts, *around, *packed)
+    fields = jax.tree.leaves(contacts), jax.tree.leaves(after)
+    return ((position, velocity), after), Touch(packed, fields[0], position, fields[1])
+
+
+def touch_step_vjp(
+    simulation: Simulation,
+    motion: Motion,
+    touch: Touch,
+    packed_bar: tuple[Axes, Axes],
+    direction_bar: Float[Array, "3 2 N"],
+) -> tuple[tuple[Axes, Axes], Float[Array, "3 2 N"], dict[str, Array]]:
+    """Cotangents of the state and directions before `touch_step`, and of `PARAMETERS`."""
+    settings = simulation.self_contact
+    assert settings is not None
+    position_bar, velocity_bar = (jnp.stack(bar) for bar in packed_bar)
+    contacts = Contacts(*touch.before), Contacts(*touch.after)
+    around = _around(simulation, motion)
+    bars = position_bar, velocity_bar, direction_bar
+    bars, parameters_bar = touch_vjp(
+        settings, *contacts, *around, *touch.moved, touch.touched, bars
     )
-    return (position, velocity), contacts
+    position_bar, velocity_bar, direction_bar = bars
+    return (list(position_bar), list(velocity_bar)), direction_bar, parameters_bar
+
+
+def _around(simulation: Simulation, motion: Motion) -> tuple[Array, Array, Array]:
+    """Inverse masses, zero for particles that are held, the floor, and the time step."""
+    inverse_mass = jnp.where(motion.held, 0.0, 1.0 / simulation.mass)
+    return inverse_mass, simulation.radius, simulation.time_step

@@ -7,7 +7,6 @@ contact does is told, and differentiated, in layers.py; this is the same without
 derivatives, and looks only at what is near.
 """
 
-from functools import cache
 from math import sqrt
 from typing import no_type_check  # numba needs functions as they are, not wrapped in checks
 
@@ -24,10 +23,14 @@ from jaxsimp.dynamics.contact.cpu.foreign import (
     register,
     results,
     scalar,
+    tensor,
     vector,
 )
 
-NUM_OPERANDS, NUM_RESULTS = 14, 9
+NUM_CHANGING = 10
+"""Positions, velocities, and the fields of `Contacts`."""
+NUM_OPERANDS = NUM_CHANGING + 6
+NUM_VJP_OPERANDS, NUM_VJP_RESULTS = 10, 5
 LANES = 16
 """Particles that are compared at a time."""
 DE_BRUIJN = np.uint32(0x077CB531)
@@ -40,25 +43,26 @@ FAR = np.float32(1e4)
 """What is farther away than this, metres, has no say in where cells are."""
 
 
-@cache
-def touch_target(dtype: np.dtype) -> str:
-    """Name of the operation for `jax.ffi.ffi_call`, in float32 or float64."""
-    name = f"jaxsimp_touch_{dtype.name}"
-    register(name, {"float32": _touch_float32, "float64": _touch_float64}[dtype.name])
-    return name
+def register_kernel(name: str, dtype: str) -> None:
+    """Make a kernel, `touch` or `touch_vjp`, known to XLA as an operation of float32 or float64.
+
+    Raises:
+        jax.errors.JaxRuntimeError: if XLA does not support its interface.
+    """
+    register(f"jaxsimp_{name}_{dtype}", globals()[f"_{name}_{dtype}"])
 
 
 @no_type_check
 def _touch_float32(frame):
     if is_call(frame):
-        _touch(operands(frame, NUM_OPERANDS), results(frame, NUM_RESULTS), np.float32)
+        _touch(operands(frame, NUM_OPERANDS), results(frame, NUM_CHANGING), np.float32)
     return OK
 
 
 @no_type_check
 def _touch_float64(frame):
     if is_call(frame):
-        _touch(operands(frame, NUM_OPERANDS), results(frame, NUM_RESULTS), np.float64)
+        _touch(operands(frame, NUM_OPERANDS), results(frame, NUM_CHANGING), np.float64)
     return OK
 
 
@@ -66,23 +70,29 @@ def _touch_float64(frame):
 @no_type_check
 def _touch(sources, targets, real):
     position, velocity = matrix(targets[0], real), matrix(targets[1], real)
-    pairs, direction = matrix(targets[2], np.int32), matrix(targets[3], real)
-    found_at, allowance = matrix(targets[4], real), vector(targets[5], real)
-    carried, missed = vector(targets[6], real), scalar(targets[7], np.int32)
-    renewed = scalar(targets[8], np.bool_)
-    for place in range(8):
-        is_real = place != 2 and place != 7
-        pass_on(sources[place], targets[place], position.itemsize // 4 if is_real else 1)
-    inverse_mass, numbers = vector(sources[8], real), vector(sources[9], real)
-    frame, apart = matrix(sources[10], np.int32), matrix(sources[11], real)
-    is_sheet, passes = scalar(sources[12], np.bool_)[0], scalar(sources[13], np.int32)[0]
+    partner, listed_by = matrix(targets[2], np.int32), matrix(targets[3], np.int32)
+    direction = tensor(targets[4], real)
+    found_at, allowance = matrix(targets[5], real), vector(targets[6], real)
+    carried, missed = vector(targets[7], real), scalar(targets[8], real)
+    renewed = scalar(targets[9], np.bool_)
+    words = position.itemsize // 4
+    for place in range(9):
+        pass_on(sources[place], targets[place], 1 if place == 2 or place == 3 else words)
+    inverse_mass, numbers = vector(sources[10], real), vector(sources[11], real)
+    frame, apart = matrix(sources[12], np.int32), matrix(sources[13], real)
+    is_sheet, passes = scalar(sources[14], np.bool_)[0], scalar(sources[15], np.int32)[0]
     halo = (position.shape[1] - len(carried)) // 2
     here, speed = _rows(position, halo), _rows(velocity, halo)
     if passes > 0:
-        missed[0] += _resolve(here, speed, pairs, direction, carried, inverse_mass, numbers, passes)
+        missed[0] += _resolve(
+            here, speed, partner, direction, carried, inverse_mass, numbers, passes
+        )
     renewed[0] = _gone_too_far(here, found_at, allowance)
     if renewed[0]:
-        _find(here, pairs, direction, found_at, allowance, numbers, frame, apart, is_sheet)
+        _find(
+            *(here, partner, listed_by, direction, found_at, allowance),
+            *(numbers, frame, apart, is_sheet),
+        )
 
 
 @njit(inline="always")
@@ -139,8 +149,8 @@ def _middle_of_moves(position, found_at):
 
 @compiled
 @no_type_check
-def _resolve(position, velocity, pairs, direction, carried, inverse_mass, numbers, passes):
-    """Impulses and pushes, see `self_contact.resolve`; returns how many contacts were missed.
+def _resolve(position, velocity, partner, direction, carried, inverse_mass, numbers, passes):
+    """Impulses and pushes, see impulses.py; returns the number of contacts missed.
 
     Selections, not branches: what touches and what does not is anybody's guess.
     """
@@ -148,9 +158,11 @@ def _resolve(position, velocity, pairs, direction, carried, inverse_mass, number
     thickness, reach = numbers[1], numbers[2] * numbers[2]
     friction, floor, rate, level = numbers[5], numbers[6], real(1) / numbers[7], numbers[8]
     (px, py, pz), (vx, vy, vz) = position, velocity
-    along_x, along_y, along_z = direction[0], direction[1], direction[2]
-    firsts, seconds = pairs[0], pairs[1]
-    count, num_pairs, missed = len(carried), _length(firsts, seconds), 0
+    count, missed = len(carried), 0
+    along, partners = direction.reshape(3, 2 * count), partner.reshape(2 * count)
+    along_x, along_y, along_z = along[0], along[1], along[2]
+    slots = np.empty(2 * count + 1, np.uint32)
+    num_pairs = _list_slots(partner, slots)
     shares, lying, total = np.empty(count, real), np.empty(count, real), np.empty((6, count), real)
     push_x, push_y, push_z, kick_x, kick_y, kick_z = total
     touching = np.empty(num_pairs + 1, np.uint32)
@@ -162,8 +174,8 @@ def _resolve(position, velocity, pairs, direction, carried, inverse_mass, number
         shares[:] = zero
         num_touching = np.uint32(0)
         for place in range(num_pairs):
-            pair = np.uint32(place)
-            i, j = np.uint32(firsts[pair]), np.uint32(seconds[pair])
+            pair = slots[np.uint32(place)]
+            i, j = _particle(pair, count), np.uint32(partners[pair])
             nx, ny, nz = along_x[pair], along_y[pair], along_z[pair]
             x, y, z = px[i] - px[j], py[i] - py[j], pz[i] - pz[j]
             distance = nx * x + ny * y + nz * z
@@ -193,7 +205,7 @@ def _resolve(position, velocity, pairs, direction, carried, inverse_mass, number
         for each in range(num_touching):
             place = np.uint32(each)
             pair = touching[place]
-            i, j = np.uint32(firsts[pair]), np.uint32(seconds[pair])
+            i, j = _particle(pair, count), np.uint32(partners[pair])
             mine, yours, gap = own[place], others[place], gaps[place]
             both = mine * inverse_mass[i] * shares[i] + yours * inverse_mass[j] * shares[j]
             if not both > zero:
@@ -234,21 +246,47 @@ def _resolve(position, velocity, pairs, direction, carried, inverse_mass, number
 
 @njit(inline="always")
 @no_type_check
-def _length(firsts, seconds):
-    """How many pairs are listed: the rest are particles with themselves."""
-    length = 0
-    while length < len(firsts) and firsts[length] != seconds[length]:
-        length += 1
+def _particle(slot, count):
+    """The particle whose slot it is."""
+    return slot - np.uint32(count) if slot >= np.uint32(count) else slot
+
+
+@njit(inline="always")
+@no_type_check
+def _list_slots(partner, slots):
+    """Write the slots that hold a pair; returns their number."""
+    length, count = np.uint32(0), np.uint32(partner.shape[1])
+    above, below = partner[0], partner[1]
+    # Written in any case, and kept if it is a pair: no branch to guess.
+    for place in range(count):
+        i = np.uint32(place)
+        slots[length] = i
+        length += np.uint32(above[i] != i)
+    for place in range(count):
+        i = np.uint32(place)
+        slots[length] = count + i
+        length += np.uint32(below[i] != i)
     return length
 
 
 @compiled
 @no_type_check
-def _find(position, pairs, direction, found_at, allowance, numbers, frame, apart, is_sheet):
+def _find(
+    position,
+    partner,
+    listed_by,
+    direction,
+    found_at,
+    allowance,
+    numbers,
+    frame,
+    apart,
+    is_sheet,
+):
     """Look up the nearest on either side of each, and the directions of their contacts."""
     real = position[0].dtype.type
     count = len(position[0])
-    adjacent, thickness, slack = numbers[0] * numbers[0], numbers[1], numbers[3]
+    adjacent, slack = numbers[0] * numbers[0], numbers[3]
     squash, level, touching, reach = numbers[4], numbers[8], numbers[9], numbers[10]
     search, half = numbers[11], real(0.5)
     order, start, rows, columns = _sorted_into_cells(position, search)
@@ -309,26 +347,30 @@ def _find(position, pairs, direction, found_at, allowance, numbers, frame, apart
         allowance[i] = max(slack, half * free)
         for axis in range(3):
             found_at[axis, i] = position[axis][i]
-    _list_pairs(position, best, across, pairs, direction, thickness, level, is_sheet)
+    _list_pairs(position, best, across, partner, listed_by, direction, level, is_sheet)
 
 
 @compiled
 @no_type_check
-def _list_pairs(position, best, across, pairs, direction, thickness, level, is_sheet):
+def _list_pairs(position, best, across, partner, listed_by, direction, level, is_sheet):
     """List each particle and its nearest on a side, each pair once, with its direction."""
-    length = 0
-    for i in range(len(best)):
+    count, capacity = len(best), len(listed_by)
+    num_listings = np.zeros(count, np.int64)
+    listed_by[:] = 2 * count
+    for i in range(count):
         above, below = best[i, 0], best[i, 1]
         for k in range(2):
             j = best[i, k]
             # Not those that have been met from the other side.
             met = j < i and (best[j, 0] == i or best[j, 1] == i)
-            if j != i and not met and not (k == 1 and below == above):
-                pairs[0, length], pairs[1, length] = i, j
-                _direct(i, j, length, position, across, is_sheet, thickness, level, direction)
-                length += 1
-    pairs[0, length:] = 0
-    pairs[1, length:] = 0
+            partner[k, i] = i
+            direction[0, k, i], direction[1, k, i], direction[2, k, i] = 0, 0, 1
+            if j == i or met or (k == 1 and below == above) or num_listings[j] == capacity:
+                continue
+            partner[k, i] = j
+            listed_by[num_listings[j], j] = k * count + i
+            num_listings[j] += 1
+            _direct(i, j, k, position, across, is_sheet, level, direction)
 
 
 @njit(inline="always")
@@ -456,8 +498,8 @@ def _compare(i, j, dx, dy, dz, squared, across, is_sheet, numbers, nearest, best
 
 @compiled
 @no_type_check
-def _direct(i, j, pair, position, across, is_sheet, thickness, level, direction):
-    """The direction of a contact, see `self_contact.directions`."""
+def _direct(i, j, k, position, across, is_sheet, level, direction):
+    """The direction of a contact, see directions.py."""
     real = position[0].dtype.type
     zero, one = real(0), real(1)
     dx = position[0][i] - position[0][j]
@@ -487,4 +529,227 @@ def _direct(i, j, pair, position, across, is_sheet, thickness, level, direction)
             dx, dy, dz = dx - part * yx, dy - part * yy, dz - part * yz
         if dx * dx + dy * dy + dz * dz >= level * level:
             x, y, z = _unit(dx, dy, dz, sx, sy, sz)
-    direction[0, pair], direction[1, pair], direction[2, pair] = x, y, z
+    direction[0, k, i], direction[1, k, i], direction[2, k, i] = x, y, z
+
+
+@no_type_check
+def _touch_vjp_float32(frame):
+    if is_call(frame):
+        _touch_vjp(operands(frame, NUM_VJP_OPERANDS), results(frame, NUM_VJP_RESULTS), np.float32)
+    return OK
+
+
+@no_type_check
+def _touch_vjp_float64(frame):
+    if is_call(frame):
+        _touch_vjp(operands(frame, NUM_VJP_OPERANDS), results(frame, NUM_VJP_RESULTS), np.float64)
+    return OK
+
+
+@compiled
+@no_type_check
+def _touch_vjp(sources, targets, real):
+    """Cotangents of what goes into the passes over all contacts, for those of what comes out."""
+    position, velocity = matrix(sources[0], real), matrix(sources[1], real)
+    partner, direction = matrix(sources[2], np.int32), tensor(sources[3], real)
+    carried, inverse_mass = vector(sources[4], real), vector(sources[5], real)
+    numbers = vector(sources[6], real)
+    given_position, given_velocity = matrix(sources[7], real), matrix(sources[8], real)
+    passes = scalar(sources[9], np.int32)[0]
+    position_bar, velocity_bar = matrix(targets[0], real), matrix(targets[1], real)
+    direction_bar, mass_bar = tensor(targets[2], real), vector(targets[3], real)
+    numbers_bar = vector(targets[4], real)
+    position_bar[:], velocity_bar[:] = given_position, given_velocity
+    direction_bar[:] = 0
+    mass_bar[:] = 0
+    numbers_bar[:] = 0
+    count = len(carried)
+    halo = (position.shape[1] - count) // 2
+    starts, held_up = np.empty((passes, 6, count), real), np.empty((passes, count), real)
+    for turn in range(passes):
+        if turn == 0:
+            for axis in range(3):
+                starts[0, axis] = position[axis, halo : halo + count]
+                starts[0, 3 + axis] = velocity[axis, halo : halo + count]
+            held_up[0] = carried
+        else:
+            starts[turn] = starts[turn - 1]
+            held_up[turn] = held_up[turn - 1]
+            _resolve(
+                (starts[turn, 0], starts[turn, 1], starts[turn, 2]),
+                (starts[turn, 3], starts[turn, 4], starts[turn, 5]),
+                *(partner, direction, held_up[turn], inverse_mass, numbers, 1),
+            )
+    for back in range(passes):
+        turn = passes - 1 - back
+        _pass_vjp(
+            *(starts[turn], held_up[turn], partner, direction, inverse_mass, numbers),
+            *(position_bar, velocity_bar, direction_bar, mass_bar, numbers_bar),
+        )
+
+
+@compiled
+@no_type_check
+def _pass_vjp(
+    start,
+    carried,
+    partner,
+    direction,
+    inverse_mass,
+    numbers,
+    position_bar,
+    velocity_bar,
+    direction_bar,
+    mass_bar,
+    numbers_bar,
+):
+    """Adjoint of one pass of `_resolve`: cotangents of its result become those of its start."""
+    real = carried.dtype.type
+    zero, one, half = real(0), real(1), real(0.5)
+    thickness, reach = numbers[1], numbers[2] * numbers[2]
+    friction, floor, seconds = numbers[5], numbers[6], numbers[7]
+    px, py, pz, vx, vy, vz = start
+    count = len(carried)
+    touching = np.empty((2 * count, 3), np.uint32)
+    own, others, shares = (
+        np.empty(2 * count, real),
+        np.empty(2 * count, real),
+        np.zeros(count, real),
+    )
+    num_touching = 0
+    for side in range(2):
+        for i in range(count):
+            j = partner[side, i]
+            if j == i:
+                continue
+            nx, ny, nz = direction[0, side, i], direction[1, side, i], direction[2, side, i]
+            x, y, z = px[i] - px[j], py[i] - py[j], pz[i] - pz[j]
+            distance = nx * x + ny * y + nz * z
+            gap = distance - thickness
+            approach = nx * (vx[i] - vx[j]) + ny * (vy[i] - vy[j]) + nz * (vz[i] - vz[j])
+            lacking = -max(gap, zero) / seconds - approach
+            near = x * x + y * y + z * z - distance * distance < reach
+            if not (near and (gap < zero or lacking > zero)):
+                continue
+            mine = one - carried[i] if nz < -half else one
+            yours = one - carried[j] if nz > half else one
+            shares[i] += mine
+            shares[j] += yours
+            own[num_touching], others[num_touching] = mine, yours
+            touching[num_touching, 0], touching[num_touching, 1] = i, j
+            touching[num_touching, 2] = side
+            num_touching += 1
+    if num_touching == 0:
+        return
+    # Where the table stops a push, its cotangent ends.
+    raised = np.zeros(count, real)
+    for place in range(num_touching):
+        i, j, side = touching[place]
+        mine, yours = own[place], others[place]
+        both = mine * inverse_mass[i] * shares[i] + yours * inverse_mass[j] * shares[j]
+        if both > zero:
+            nx, ny, nz = direction[0, side, i], direction[1, side, i], direction[2, side, i]
+            x, y, z = px[i] - px[j], py[i] - py[j], pz[i] - pz[j]
+            gap = nx * x + ny * y + nz * z - thickness
+            push = min(max(-gap, zero), thickness) / both * nz
+            raised[i] += mine * push
+            raised[j] -= yours * push
+    pushed_bar, kicked_bar = position_bar.copy(), velocity_bar.copy()
+    for i in range(count):
+        height = pz[i] + inverse_mass[i] * raised[i]
+        if height < min(pz[i], floor):
+            pushed_bar[2, i] = zero
+            if pz[i] >= floor:
+                numbers_bar[2] += position_bar[2, i]
+                position_bar[2, i] = zero
+    for place in range(num_touching):
+        i, j, side = touching[place]
+        mine, yours = own[place], others[place]
+        first, second = inverse_mass[i], inverse_mass[j]
+        both = mine * first * shares[i] + yours * second * shares[j]
+        if not both > zero:
+            continue
+        per = one / both
+        nx, ny, nz = direction[0, side, i], direction[1, side, i], direction[2, side, i]
+        x, y, z = px[i] - px[j], py[i] - py[j], pz[i] - pz[j]
+        u, v, w = vx[i] - vx[j], vy[i] - vy[j], vz[i] - vz[j]
+        approach = nx * u + ny * v + nz * w
+        sx, sy, sz = u - approach * nx, v - approach * ny, w - approach * nz
+        gap = nx * x + ny * y + nz * z - thickness
+        lacking = -max(gap, zero) / seconds - approach
+        pressed = min(max(-gap, zero), thickness)
+        impulse, push = per * max(lacking, zero), per * pressed
+        square = sx * sx + sy * sy + sz * sz
+        inverse = one / sqrt(max(square, real(1e-12)))
+        sticks = half * per <= friction * impulse * inverse
+        rub = half * per if sticks else friction * impulse * inverse
+        # Cotangents of the push on both, and of the change of both velocities.
+        a, b = first * mine, second * yours
+        fx = a * pushed_bar[0, i] - b * pushed_bar[0, j]
+        fy = a * pushed_bar[1, i] - b * pushed_bar[1, j]
+        fz = a * pushed_bar[2, i] - b * pushed_bar[2, j]
+        gx = first * kicked_bar[0, i] - second * kicked_bar[0, j]
+        gy = first * kicked_bar[1, i] - second * kicked_bar[1, j]
+        gz = first * kicked_bar[2, i] - second * kicked_bar[2, j]
+        push_bar = fx * nx + fy * ny + fz * nz
+        impulse_bar = gx * nx + gy * ny + gz * nz
+        rub_bar = -(gx * sx + gy * sy + gz * sz)
+        slide = -rub
+        per_bar = zero
+        if sticks:
+            per_bar += half * rub_bar
+        else:
+            numbers_bar[1] += impulse * inverse * rub_bar
+            impulse_bar += friction * inverse * rub_bar
+        ax, ay, az = slide * gx, slide * gy, slide * gz
+        if not sticks and square > real(1e-12):
+            slope = -friction * impulse * inverse * inverse * inverse * rub_bar
+            ax, ay, az = ax + slope * sx, ay + slope * sy, az + slope * sz
+        approach_bar = -(ax * nx + ay * ny + az * nz)
+        ox = push * fx + impulse * gx - approach * ax
+        oy = push * fy + impulse * gy - approach * ay
+        oz = push * fz + impulse * gz - approach * az
+        gap_bar = zero
+        if lacking > zero:
+            per_bar += lacking * impulse_bar
+            lacking_bar = per * impulse_bar
+            approach_bar -= lacking_bar
+            if gap > zero:
+                gap_bar -= lacking_bar / seconds
+                numbers_bar[3] += lacking_bar * gap / (seconds * seconds)
+        per_bar += pressed * push_bar
+        if pressed == thickness:
+            numbers_bar[0] += per * push_bar
+        elif pressed > zero:
+            gap_bar -= per * push_bar
+        numbers_bar[0] -= gap_bar
+        ox += gap_bar * x + approach_bar * u
+        oy += gap_bar * y + approach_bar * v
+        oz += gap_bar * z + approach_bar * w
+        direction_bar[0, side, i] += ox
+        direction_bar[1, side, i] += oy
+        direction_bar[2, side, i] += oz
+        ax, ay, az = ax + approach_bar * nx, ay + approach_bar * ny, az + approach_bar * nz
+        velocity_bar[0, i] += ax
+        velocity_bar[1, i] += ay
+        velocity_bar[2, i] += az
+        velocity_bar[0, j] -= ax
+        velocity_bar[1, j] -= ay
+        velocity_bar[2, j] -= az
+        x, y, z = gap_bar * nx, gap_bar * ny, gap_bar * nz
+        position_bar[0, i] += x
+        position_bar[1, i] += y
+        position_bar[2, i] += z
+        position_bar[0, j] -= x
+        position_bar[1, j] -= y
+        position_bar[2, j] -= z
+        both_bar = -per * per * per_bar
+        cx, cy, cz = impulse * nx - rub * sx, impulse * ny - rub * sy, impulse * nz - rub * sz
+        mass_bar[i] += mine * shares[i] * both_bar + mine * push * (
+            nx * pushed_bar[0, i] + ny * pushed_bar[1, i] + nz * pushed_bar[2, i]
+        )
+        mass_bar[i] += cx * kicked_bar[0, i] + cy * kicked_bar[1, i] + cz * kicked_bar[2, i]
+        mass_bar[j] += yours * shares[j] * both_bar - yours * push * (
+            nx * pushed_bar[0, j] + ny * pushed_bar[1, j] + nz * pushed_bar[2, j]
+        )
+        mass_bar[j] -= cx * kicked_bar[0, j] + cy * kicked_bar[1, j] + cz * kicked_bar[2, j]

@@ -1,0 +1,108 @@
+"""The compiled kernels as functions of JAX, on the CPU."""
+
+import warnings
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxlib.version
+from jax.tree_util import PyTreeDef
+from jaxtyping import Array, Float
+
+from jaxsimp.dynamics.contact.settings import LEVEL, SEARCH, SelfContact
+
+
+@cache
+def has_kernel(name: str, dtype: str) -> bool:
+    """Whether this XLA calls a kernel, by its name in kernels.py and the type of its numbers.
+
+    A kernel is compiled, or loaded, when it is first asked for. If XLA does not support the
+    interface, a warning says so once: the definition in JAX gives the same, slower.
+    """
+    from jaxsimp.dynamics.contact.cpu import kernels  # numba takes a while to import
+
+    try:
+        kernels.register_kernel(name, dtype)
+    except jax.errors.JaxRuntimeError as error:
+        _warn(str(error))
+        return False
+    return True
+
+
+@cache
+def _warn(reason: str) -> None:
+    warnings.warn(
+        f"self-contact runs without its compiled kernel, many times slower on a CPU: this jaxlib "
+        f"({jaxlib.version.__version__}) does not support its interface ({reason})",
+        stacklevel=2,
+    )
+
+
+def touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
+    """Position, velocity and fields of the contacts, as `layers.touch` defines them."""
+    settings, contacts, inverse_mass, floor, seconds, position, velocity = jax.tree.unflatten(
+        tree, leaves
+    )
+    real = position.dtype
+    changing = [position, velocity, *jax.tree.leaves(contacts)]
+    call = jax.ffi.ffi_call(
+        f"jaxsimp_touch_{real}",
+        [jax.ShapeDtypeStruct(each.shape, each.dtype) for each in changing],
+        vmap_method="sequential",
+        # All but positions and velocities: made to share those, XLA copies more, not less.
+        input_output_aliases={place: place for place in range(2, len(changing))},
+    )
+    constant = (
+        inverse_mass,
+        _numbers(settings, floor, seconds, real),
+        settings.frame.astype(jnp.int32),
+        settings.apart.astype(real),
+        jnp.asarray(settings.is_sheet),
+        jnp.asarray(passes, jnp.int32),
+    )
+    return list(call(*changing, *constant))
+
+
+def touch_vjp(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
+    """Cotangents as in `layers.touch_vjp`, without those through directions."""
+    settings, before, inverse_mass, floor, seconds, position, velocity, *bars = jax.tree.unflatten(
+        tree, leaves
+    )
+    real, count = position.dtype, len(inverse_mass)
+    shapes = ((3, count), (3, count), (3, 2, count), (count,), (4,))
+    call = jax.ffi.ffi_call(
+        f"jaxsimp_touch_vjp_{real}",
+        [jax.ShapeDtypeStruct(shape, real) for shape in shapes],
+        vmap_method="sequential",
+    )
+    numbers = _numbers(settings, floor, seconds, real)
+    fields = before.partner, before.direction, before.carried
+    passes_now = jnp.asarray(passes, jnp.int32)
+    found = call(position, velocity, *fields, inverse_mass, numbers, *bars, passes_now)
+    position_bar, velocity_bar, direction_bar, mass_bar, numbers_bar = found
+    return [position_bar, velocity_bar, direction_bar, mass_bar, *numbers_bar]
+
+
+def _numbers(
+    settings: SelfContact, floor: Float[Array, ""], seconds: Float[Array, ""], real: Any
+) -> Float[Array, " 12"]:
+    """Settings in the order in which kernels.py reads them."""
+    stretch = jnp.sqrt(1 + settings.squash)
+    near = stretch * settings.thickness
+    reach = jnp.hypot(settings.lateral, near + stretch * settings.margin)
+    numbers = [
+        settings.adjacent,
+        settings.thickness,
+        settings.lateral,
+        settings.slack,
+        settings.squash,
+        settings.friction,
+        floor,
+        seconds,
+        LEVEL * settings.thickness,
+        jnp.hypot(settings.lateral, near),
+        reach,
+        SEARCH * reach,
+    ]
+    return jnp.stack([jnp.asarray(each, real) for each in numbers])
