@@ -33,10 +33,23 @@ from jaxsimp.dynamics.step import Axes, Motion, Packed, step_and_free, step_vjp
 def plain_steps(
     simulation: Simulation, moving: Moving, motion: Motion, shares: Float[Array, " S"]
 ) -> Moving:
-    """Time steps in which held particles move by shares of their drive."""
+    """Time steps in which held particles move by shares of their drive.
 
+    In JAX alone, so that it differentiates them in any mode and order.
+    """
+    return _run(simulation, moving, motion, shares, use_kernel=False)
+
+
+def _run(
+    simulation: Simulation,
+    moving: Moving,
+    motion: Motion,
+    shares: Float[Array, " S"],
+    *,
+    use_kernel: bool,
+) -> Moving:
     def one(moving: Moving, share: Float[Array, ""]) -> tuple[Moving, None]:
-        return advance(simulation, moving, motion, share), None
+        return advance(simulation, moving, motion, share, use_kernel=use_kernel), None
 
     return jax.lax.scan(one, moving, shares)[0]
 
@@ -44,7 +57,10 @@ def plain_steps(
 def steps(
     simulation: Simulation, moving: Moving, motion: Motion, shares: Float[Array, " S"]
 ) -> Moving:
-    """`plain_steps`, differentiated in reverse mode by the adjoint; shares count as constants."""
+    """`plain_steps`, differentiated in reverse mode, once, by the adjoint.
+
+    Shares count as constants. A CPU runs contact by its compiled kernels.
+    """
     leaves, tree = jax.tree.flatten(simulation)
     return _moving(_steps(tree, leaves, _flat(moving), motion.held, motion.drive, shares))
 
@@ -69,7 +85,8 @@ def _steps(
         leaves, shares = shared
         flat, *motion = own
         simulation = _simulation(tree, leaves)
-        return _flat(plain_steps(simulation, _moving(flat), Motion(*motion), shares))
+        moving = _run(simulation, _moving(flat), Motion(*motion), shares, use_kernel=True)
+        return _flat(moving)
 
     return _batched(run, flat)((leaves, shares), (flat, held, drive))
 

@@ -1,6 +1,6 @@
 """Rollouts: semi-implicit Euler steps of a simulation under actions, as `jax.lax.scan`.
 
-Pure functions of arrays: `jit`, `vmap` and `grad` apply. Reverse mode uses the adjoint of
+Pure functions of arrays: `jit`, `vmap`, `grad` and `scan` apply. Reverse mode uses the adjoint of
 adjoint.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`.
 """
 
@@ -66,7 +66,12 @@ def rollout_observing(
         moving = run(simulation, moving, motion, speed_profile(pickers.steps))
         return moving, observe(end(simulation, moving), action)
 
-    moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
+    try:
+        moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
+    except TypeError as error:
+        if "custom_vjp" in str(error):
+            error.add_note("the adjoint is for reverse mode: pass adjoint=False to rollout")
+        raise
     return end(simulation, moving), observations
 
 

@@ -35,6 +35,7 @@ from jaxsimp.dynamics.contact.settings import (
     SPARE,
     make_self_contact,
 )
+from jaxsimp.dynamics.simulation import PHYSICS
 from jaxsimp.engines import default_layout, spring_chunk_size
 from jaxsimp.tasks import make_task
 
@@ -480,7 +481,7 @@ def test_twice_folded_cloths_settle_with_no_particles_closer_than_their_thicknes
 
 def colliding_rollout(simulation, pickers, state, displacement):
     """The second of two ropes' ends, laid over the first."""
-    actions = Actions(jnp.asarray([[20, NONE]]), displacement[None])
+    actions = Actions(jnp.asarray([[17, NONE]]), displacement[None])
     return rollout(simulation, pickers, state, actions)[0]
 
 
@@ -565,3 +566,134 @@ def test_samples_that_touch_themselves_run_one_by_one():
     touching, passing = (make_simulation(body, 1e-3, self_contact=each) for each in (True, False))
     assert default_layout(64, spring_chunk_size(touching)).chunk_size == 1
     assert default_layout(64, spring_chunk_size(passing)).chunk_size > 1
+
+
+# Two paths, one function
+
+
+def fold_by_hand(side: int, self_contact: bool = True):
+    """A cloth whose one edge is carried over to the other and let go: about 500 time steps."""
+    body = cloth((side, side))
+    simulation = make_simulation(body, 1.9e-3, self_contact=self_contact)
+    moves, picks = np.zeros((4, 2, 3)), np.full((4, 2), NONE)
+    moves[:2, :, 0], moves[0, :, 2], moves[1, :, 2] = 0.145, 0.1, -0.094
+    picks[:2] = [0, side - 1]
+    actions = Actions(jnp.asarray(picks), jnp.asarray(moves, float))
+    return simulation, make_pickers((0.2, 0.2, 0.2), steps=125), at_rest(goals.flat(body)), actions
+
+
+def compared(run, path, monkeypatch):
+    """Results of the kernel and of the definition."""
+    if path == "definition":
+        pytest.skip("compares both")
+    # Optimised, as for users: reciprocal roots are less exact otherwise, to 1e-4 of float32's.
+    options = {"xla_backend_optimization_level": 3}
+    found = jax.jit(run, compiler_options=options)()
+    monkeypatch.setattr(compiled, "has_kernel", lambda name, dtype: False)
+    return found, jax.jit(lambda: run(), compiler_options=options)()
+
+
+@pytest.mark.parametrize(("real", "metres"), [("float32", 1e-7), ("float64", 1e-12)])
+def test_kernel_and_definition_agree_over_a_fold(real, metres, path, monkeypatch):
+    with jax.enable_x64(real == "float64"):
+        simulation, pickers, start, actions = fold_by_hand(11)
+        run = partial(rollout, simulation, pickers, start, actions)
+        found, wanted = compared(lambda: run()[0], path, monkeypatch)
+        assert np.ptp(found.position[:, 2]) > 2 * float(simulation.radius)  # two layers
+        np.testing.assert_allclose(found.position, wanted.position, rtol=0, atol=metres)
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_adjoint_is_the_derivative_that_jax_takes():
+    simulation, _, start, actions = fold_by_hand(5)
+    pickers = make_pickers((0.2, 0.2, 0.2), steps=40)
+    weights = jnp.asarray(np.random.default_rng(0).standard_normal(start.position.shape))
+
+    def cost(adjoint, numbers, position, displacement):
+        *own, friction, thickness = numbers
+        contact = replace(simulation.self_contact, friction=friction, thickness=thickness)
+        changed = replace(simulation, self_contact=contact, **dict(zip(PHYSICS, own, strict=True)))
+        plan, begun = Actions(actions.pick, displacement), at_rest(position)
+        final = rollout(changed, pickers, begun, plan, adjoint=adjoint)[0]
+        return jnp.sum(weights * (final.position + 0.01 * final.velocity))
+
+    # Folded before, so that contacts are there from the start.
+    folded = rollout(simulation, pickers, start, actions)[0].position
+    contact = simulation.self_contact
+    own = [getattr(simulation, name) for name in PHYSICS]
+    arguments = [*own, contact.friction, contact.thickness], folded, actions.displacement
+    found, wanted = (
+        jax.jit(jax.grad(partial(cost, adjoint), (0, 1, 2)))(*arguments)
+        for adjoint in (True, False)
+    )
+    assert all(np.any(leaf != 0) for leaf in jax.tree.leaves(wanted))  # they rub, and press
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        # Rounding, in sums over 160 steps.
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
+
+
+def test_a_busy_sample_looks_up_for_itself_alone():
+    """A batch of samples, of which some are due: contacts are those of each by itself."""
+    body = cloth((9, 9), (0.1, 0.1))
+    settings = make_self_contact(body, 1e-3)
+    still = jnp.asarray(crumpled(body, 2, 0.05))
+    contacts = find_contacts(settings, still, ZERO)
+    moved = jnp.stack([still, still.at[0, ::2].add(0.03), still, still.at[2, :40].add(-0.02)])
+    nothing = jnp.zeros(body.num_particles)
+
+    def one(position):
+        return touch(settings, contacts, nothing, ZERO, ZERO, position, 0 * position, passes=0)[2]
+
+    found = jax.jit(jax.vmap(one))(moved)
+    np.testing.assert_array_equal(found.renewed, [False, True, False, True])
+    for index, position in enumerate(moved):
+        alone = one(position)
+        for name in ("partner", "listed_by", "found_at", "allowance"):
+            np.testing.assert_allclose(getattr(found, name)[index], getattr(alone, name), atol=1e-7)
+
+
+def test_a_control_loop_is_a_scan_over_rollouts():
+    """A state goes in and comes out, under vmap and grad; with contact as without."""
+    simulation, pickers, position, _ = laid_over()
+    action = Actions(jnp.asarray([[17, NONE]]), jnp.zeros((1, 2, 3)))
+
+    def cost(simulation, move):
+        def act(state, _):
+            toward = move * (state.position[17] - state.position[3])
+            plan = replace(action, displacement=action.displacement.at[0, 0].set(toward))
+            state, _ = rollout(simulation, pickers, state, plan)
+            return state, state.missed
+
+        final, missed = jax.lax.scan(act, at_rest(position), length=3)
+        return final.position[17, 0], missed
+
+    for each in (simulation, replace(simulation, self_contact=None)):
+        run = jax.value_and_grad(partial(cost, each), has_aux=True)
+        (ends, missed), slopes = jax.jit(jax.vmap(run))(jnp.asarray([0.1, 0.3]))
+        assert missed.shape == (2, 3)
+        assert np.all(np.isfinite(slopes))
+        assert np.all(slopes != 0)
+        assert ends[0] != ends[1]
+
+
+def test_what_is_compiled_for_a_gpu_calls_nothing_of_a_cpu(path):
+    simulation, pickers, position, displacement = laid_over()
+    run = partial(colliding_rollout, simulation, pickers, at_rest(position))
+    several = jnp.asarray(np.stack([displacement] * 3), jnp.float32)
+    gradient = jax.grad(lambda displacement: run(displacement).position.sum())
+    for function in (run, gradient):
+        traced = jax.jit(jax.vmap(function)).trace(several)
+        text = traced.lower(lowering_platforms=("cuda",)).as_text()
+        assert "jaxsimp" not in text
+        assert "custom_call" not in text
+        if path == "kernel":
+            assert "jaxsimp_touch" in traced.lower(lowering_platforms=("cpu",)).as_text()
+
+
+def test_forward_mode_is_told_what_to_pass():
+    simulation, pickers, position, displacement = laid_over()
+    run = partial(colliding_rollout, simulation, pickers, at_rest(position))
+    move = jnp.asarray(displacement, jnp.float32)
+    with pytest.raises(TypeError) as refused:
+        jax.jvp(run, (move,), (move,))
+    assert "adjoint=False" in " ".join(refused.value.__notes__)

@@ -50,14 +50,14 @@ class Contacts:
         renewed: whether the pairs were looked up in the last step.
     """
 
-    partner: Int[Array, "2 N"]
-    listed_by: Int[Array, "C N"]
-    direction: Float[Array, "3 2 N"]
-    found_at: Float[Array, "3 N"]
-    allowance: Float[Array, " N"]
-    carried: Float[Array, " N"]
-    missed: Float[Array, ""]
-    renewed: Bool[Array, ""]
+    partner: Int[Array, "... 2 N"]
+    listed_by: Int[Array, "... C N"]
+    direction: Float[Array, "... 3 2 N"]
+    found_at: Float[Array, "... 3 N"]
+    allowance: Float[Array, "... N"]
+    carried: Float[Array, "... N"]
+    missed: Float[Array, "..."]
+    renewed: Bool[Array, "..."]
 
     @property
     def is_pair(self) -> Bool[Array, "2 N"]:

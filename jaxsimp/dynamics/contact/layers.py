@@ -18,22 +18,13 @@ is computed by cpu/kernels.py, compiled by numba, several times as fast.
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import PyTreeDef
 from jaxtyping import Array, Float
 
-from jaxsimp.dynamics.contact.contacts import (
-    DIRECTION,
-    PLAIN,
-    REVERSIBLE,
-    Contacts,
-    Exchange,
-    no_contacts,
-)
+from jaxsimp.dynamics.contact.contacts import REVERSIBLE, Contacts, no_contacts
 from jaxsimp.dynamics.contact.cpu import compiled
 from jaxsimp.dynamics.contact.directions import across, directions
 from jaxsimp.dynamics.contact.impulses import resolve
@@ -53,9 +44,13 @@ def find_contacts(settings: SelfContact, position: Padded, missed: Float[Array, 
     """Look up the pairs that may touch, with so many contacts missed before."""
     count, real = settings.apart.shape[1], position.dtype
     nothing, zero = jnp.zeros(count, real), jnp.zeros((), real)
-    start = no_contacts(count, missed.astype(real))
-    still = jnp.zeros_like(position)
-    return touch(settings, start, nothing, zero, zero, position, still, passes=0)[2]
+    still, missed = jnp.zeros_like(position), missed.astype(real)
+    arguments = settings, no_contacts(count, zero), nothing, zero, zero, position, still
+    # The kernel has no derivatives; the pairs have none anyway.
+    _, _, found = touch(*jax.lax.stop_gradient(arguments), passes=0)
+    (here,) = _without_halo(found, position)
+    direction = directions(settings, found, here, across(settings, here))
+    return replace(found, direction=direction, missed=missed)
 
 
 def touch(
@@ -68,6 +63,7 @@ def touch(
     velocity: Padded,
     *,
     passes: int = PASSES,
+    use_kernel: bool = True,
 ) -> Touched:
     """Positions and velocities after contact, and contacts that hold until it acts again.
 
@@ -80,23 +76,20 @@ def touch(
         position: metres.
         velocity: metres per second.
         passes: number of passes over all contacts.
+        use_kernel: whether a CPU runs the compiled kernel, which JAX cannot differentiate (its
+            adjoint is `touch_vjp`). The definition is differentiable in any mode and order.
     """
     arguments = (settings, contacts, inverse_mass, floor, seconds, position, velocity)
     leaves, tree = jax.tree.flatten(arguments)
-    position, velocity, *fields = _touch(tree, passes, leaves)
+    has_kernel = use_kernel and compiled.has_kernel("touch", str(position.dtype))
+    position, velocity, *fields = _touch(tree, passes, has_kernel, leaves)
     return position, velocity, Contacts(*fields)
 
 
 # Of leaves: JAX makes trees of things that are no arrays here.
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
-    """Position, velocity and fields of the contacts."""
-    has_kernel = compiled.has_kernel("touch", str(leaves[-1].dtype))
-    return _on_device(tree, passes, has_kernel, leaves)
-
-
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _on_device(tree: PyTreeDef, passes: int, has_kernel: bool, leaves: list[Array]) -> list[Array]:
+def _touch(tree: PyTreeDef, passes: int, has_kernel: bool, leaves: list[Array]) -> list[Array]:
+    """Position, velocity and fields of the contacts."""
     define = partial(_defined, tree, passes)
     if not has_kernel:
         return define(leaves)
@@ -106,59 +99,18 @@ def _on_device(tree: PyTreeDef, passes: int, has_kernel: bool, leaves: list[Arra
 
 def _defined(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
     """`_touch`, as it is defined."""
-    settings, contacts, *_ = jax.tree.unflatten(tree, leaves)
-    carried, position, velocity, past = _passes(tree, passes, PLAIN, leaves)
-    missed = contacts.missed + (past.sum().astype(position.dtype) if passes else 0.0)
-    contacts = replace(contacts, carried=carried, missed=missed)
-    contacts = renew(settings, contacts, position)
-    halo = (leaves[-1].shape[1] - position.shape[1]) // 2
-    return [*_pad(halo, position, velocity), *jax.tree.leaves(contacts)]
-
-
-def _passes(
-    tree: PyTreeDef, passes: int, exchange: Exchange, leaves: list[Array]
-) -> tuple[Array, Array, Array, Array]:
-    """Carried particles, positions, velocities, and pairs past each other in the first pass."""
     settings, contacts, mass, floor, seconds, *moving = jax.tree.unflatten(tree, leaves)
     position, velocity = _without_halo(contacts, *moving)
-    carried, first = contacts.carried, jnp.zeros(contacts.partner.shape, bool)
+    carried, missed = contacts.carried, contacts.missed
     for turn in range(passes):
         carried, position, velocity, past = resolve(
-            *(settings, contacts, mass, floor, seconds, carried, position, velocity),
-            exchange=exchange,
+            settings, contacts, mass, floor, seconds, carried, position, velocity
         )
-        first = past if turn == 0 else first
-    return carried, position, velocity, first
-
-
-@_touch.defjvp
-def _touch_jvp(
-    tree: PyTreeDef, passes: int, primals: tuple[list[Array]], tangents: tuple[list[Any]]
-) -> tuple[list[Array], list[Any]]:
-    """Pairs, carried particles and the moment of a lookup count as constants."""
-    result = _touch(tree, passes, *primals)
-    after = Contacts(*result[2:])
-    smooth = partial(_smooth, tree, passes, after, PLAIN)
-    _, (by_position, by_velocity, by_direction) = jax.jvp(smooth, primals, tangents)
-    nothing = [_no_tangent(each) for each in result[2:]]
-    nothing[DIRECTION] = by_direction
-    return result, [by_position, by_velocity, *nothing]
-
-
-def _smooth(
-    tree: PyTreeDef, passes: int, after: Contacts, exchange: Exchange, leaves: list[Array]
-) -> tuple[Array, Array, Array]:
-    """Positions, velocities and directions, as functions that are smooth for given pairs."""
-    settings, before, *_ = jax.tree.unflatten(tree, leaves)
-    _, position, velocity, _ = _passes(tree, passes, exchange, leaves)
-    anew = directions(settings, after, position, across(settings, position), exchange)
-    halo = (leaves[-1].shape[1] - position.shape[1]) // 2
-    position, velocity = _pad(halo, position, velocity)
-    return position, velocity, jnp.where(after.renewed, anew, before.direction)
-
-
-def _pad(halo: int, *arrays: Float[Array, "3 N"]) -> list[Padded]:
-    return [jnp.pad(array, ((0, 0), (halo, halo))) for array in arrays]
+        missed = missed + past.sum() if turn == 0 else missed
+    contacts = replace(contacts, carried=carried, missed=missed)
+    contacts = renew(settings, contacts, position)
+    halo = (moving[0].shape[1] - position.shape[1]) // 2
+    return [*_pad(halo, position, velocity), *jax.tree.leaves(contacts)]
 
 
 Bars = tuple[Float[Array, "3 N"], Float[Array, "3 N"], Float[Array, "3 2 N"]]
@@ -250,7 +202,5 @@ def _without_halo(contacts: Contacts, *arrays: Padded) -> list[Float[Array, "3 N
     return [array[:, halo : halo + count] for array in arrays]
 
 
-def _no_tangent(value: Array) -> Any:
-    if jnp.issubdtype(value.dtype, jnp.floating):
-        return jnp.zeros_like(value)
-    return np.zeros(value.shape, jax.dtypes.float0)
+def _pad(halo: int, *arrays: Float[Array, "3 N"]) -> list[Padded]:
+    return [jnp.pad(array, ((0, 0), (halo, halo))) for array in arrays]

@@ -20,16 +20,17 @@ TILE = 64
 """Particles that are compared with all others at a time."""
 GROUP = 32
 """Samples of a batch that are looked up at a time."""
-LOOKED_UP = ("partner", "listed_by", "direction", "found_at", "allowance", "renewed")
+LOOKED_UP = ("partner", "listed_by", "found_at", "allowance", "renewed")
 """Fields of `Contacts` that a lookup replaces."""
 
 
 def renew(settings: SelfContact, contacts: Contacts, position: Float[Array, "3 N"]) -> Contacts:
     """Contacts that hold for the next time step: looked up again where a particle moved too far.
 
-    Under `vmap` only those samples are looked up that need it.
+    Under `vmap` only those samples are looked up that need it. Directions alone have derivatives.
     """
-    leaves, tree = jax.tree.flatten((settings, contacts, position))
+    arguments = settings, contacts, position
+    leaves, tree = jax.tree.flatten(jax.lax.stop_gradient(arguments))
 
     # Of leaves: JAX makes trees of things that are no arrays here.
     @jax.custom_batching.custom_vmap
@@ -41,6 +42,8 @@ def renew(settings: SelfContact, contacts: Contacts, position: Float[Array, "3 N
     @one.def_vmap
     def several(size: int, batched: Any, leaves: list[Array]) -> tuple[list[Array], list[bool]]:
         (is_batched,) = batched
+        if not any(is_batched):
+            return one(leaves), [False] * len(LOOKED_UP)
         axes = [0 if each else None for each in is_batched]
         is_due = jax.vmap(lambda leaves: _is_due(tree, leaves), (axes,))(leaves)
         kept = jax.vmap(lambda leaves: _kept(tree, leaves), (axes,))(leaves)
@@ -63,7 +66,9 @@ def renew(settings: SelfContact, contacts: Contacts, position: Float[Array, "3 N
         _, found = jax.lax.while_loop(lambda carry: carry[0].any(), group, (is_due, kept))
         return [*found[:-1], is_due], [True] * len(LOOKED_UP)
 
-    return replace(contacts, **dict(zip(LOOKED_UP, one(leaves), strict=True)))
+    found = replace(contacts, **dict(zip(LOOKED_UP, one(leaves), strict=True)))
+    anew = directions(settings, found, position, across(settings, position))
+    return replace(found, direction=jnp.where(found.renewed, anew, contacts.direction))
 
 
 def _is_due(tree: PyTreeDef, leaves: list[Array]) -> Bool[Array, ""]:
@@ -90,7 +95,7 @@ def _kept(tree: PyTreeDef, leaves: list[Array]) -> list[Array]:
 
 def _look_up(tree: PyTreeDef, leaves: list[Array]) -> list[Array]:
     """The fields `LOOKED_UP`."""
-    settings, contacts, position = jax.tree.unflatten(tree, leaves)
+    settings, _, position = jax.tree.unflatten(tree, leaves)
     normal = across(settings, position)
     best, nearest, clear = _nearest(settings, position, normal)
     partner, listed_by = list_pairs(best)
@@ -101,9 +106,7 @@ def _look_up(tree: PyTreeDef, leaves: list[Array]) -> list[Array]:
         (jnp.sqrt(nearest.min(axis=0)) - touching) / stretch, jnp.sqrt(clear) - touching
     )
     allowance = jnp.maximum(settings.slack, 0.5 * free)
-    contacts = replace(contacts, partner=partner, listed_by=listed_by)
-    direction = directions(settings, contacts, position, normal)
-    return [partner, listed_by, direction, position, allowance, jnp.ones((), bool)]
+    return [partner, listed_by, position, allowance, jnp.ones((), bool)]
 
 
 def _nearest(

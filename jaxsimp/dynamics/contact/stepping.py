@@ -30,15 +30,20 @@ def end(simulation: Simulation, moving: Moving) -> State:
 
 
 def advance(
-    simulation: Simulation, moving: Moving, motion: Motion, share: Float[Array, ""]
+    simulation: Simulation,
+    moving: Moving,
+    motion: Motion,
+    share: Float[Array, ""],
+    *,
+    use_kernel: bool = True,
 ) -> Moving:
-    """One time step: springs, table and pickers, then self-contact."""
+    """One time step: springs, table and pickers, then self-contact; see `touch`."""
     packed, contacts = moving
     plain = replace(simulation, self_contact=None)
     packed, _ = step_and_free(plain, packed, motion, share)
-    return (
-        (packed, None) if contacts is None else touch_step(simulation, packed, motion, contacts)[0]
-    )
+    if contacts is None:
+        return packed, None
+    return touch_step(simulation, packed, motion, contacts, use_kernel=use_kernel)[0]
 
 
 class Touch(NamedTuple):
@@ -58,13 +63,18 @@ class Touch(NamedTuple):
 
 
 def touch_step(
-    simulation: Simulation, packed: Packed, motion: Motion, contacts: Contacts
+    simulation: Simulation,
+    packed: Packed,
+    motion: Motion,
+    contacts: Contacts,
+    *,
+    use_kernel: bool = True,
 ) -> tuple[Moving, Touch]:
-    """Self-contact after a time step."""
+    """Self-contact after a time step, and what its adjoint needs."""
     settings = simulation.self_contact
     assert settings is not None
     around = _around(simulation, motion)
-    position, velocity, after = touch(settings, contacts, *around, *packed)
+    position, velocity, after = touch(settings, contacts, *around, *packed, use_kernel=use_kernel)
     fields = jax.tree.leaves(contacts), jax.tree.leaves(after)
     return ((position, velocity), after), Touch(packed, fields[0], position, fields[1])
 

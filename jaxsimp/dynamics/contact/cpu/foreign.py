@@ -261,13 +261,15 @@ def register(name: str, handler: Callable[[Any], int]) -> None:
     Raises:
         Exception: if XLA does not support the version of the interface, of a type that XLA chooses.
     """
+    if name in _registered:
+        return
     function = cfunc(types.int64(types.int64), cache=True)(handler)
     capsule = ctypes.PYFUNCTYPE(ctypes.py_object, *[ctypes.c_void_p] * 3)(
         ("PyCapsule_New", ctypes.pythonapi)
     )
-    _kept.append(function)
     jax.ffi.register_ffi_target(name, capsule(function.address, None, None), platform="cpu")
+    _registered[name] = function
 
 
-_kept: list[Any] = []
-"""What XLA calls must not be collected."""
+_registered: dict[str, Any] = {}
+"""Functions that XLA may call, by name: they must not be collected."""
