@@ -22,12 +22,12 @@ matplotlib.use("Agg")
 # make of the same operations other machine code in less than half of it; what it gives differs by
 # rounding. `JAXSIMP_OPTIMISED=1` leaves XLA as users have it, as `.ci/run` does for the tests of
 # numbers. A flag that an XLA does not know ends the process.
-EMITTERS = "--xla_cpu_use_fusion_emitters=false"
+QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 if not os.environ.get("JAXSIMP_OPTIMISED"):
     jax.config.update("jax_disable_most_optimizations", True)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"  # for processes that tests start
     if jaxlib.version.__version_info__ < (0, 11):
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {EMITTERS}".strip()
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
 
 jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -221,7 +221,7 @@ def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch,
 
     monkeypatch.setattr(plan_options, "run_study", interrupt)
     assert command(*OPTIONS, "--out", tmp_path / "new") == 130
-    assert "goes on" in capsys.readouterr().out
+    assert "resumes" in capsys.readouterr().out
 
 
 # --- wrong requests -------------------------------------------------------------------------------
