@@ -105,7 +105,8 @@ def test_members_touch_themselves_where_asked_to():
 
     touching, passing = (make_ensemble(task, 1, self_contact=touches) for touches in (True, False))
     found = costs(touching)
-    np.testing.assert_array_equal(found, costs(MassSprings(self_contact=True)))
+    # A batch of one, compiled otherwise, in float32.
+    np.testing.assert_allclose(found, costs(MassSprings(self_contact=True)), rtol=3e-6)
     assert (np.abs(costs(passing) - found) > 0.01 * found).any()
 
 
