@@ -1,6 +1,6 @@
-"""Section on self-contact: its additional cost per time step while a cloth is being folded."""
+"""Sections on self-contact: what it adds to a time step of a fold, and to a gradient."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -51,6 +51,42 @@ def self_contact(scale: Scale) -> Iterator[Row]:
         yield _row(side, touches, prepared, seconds) | {"exponent": exponent if touches else None}
 
 
+def contact_gradient(scale: Scale) -> Iterator[Row]:
+    """The cost of a gradient through self-contact, of a fold of two actions, and of its value."""
+    side = scale.contact_sides[0]
+    functions = {"forward": _spread, "gradient": jax.value_and_grad(_spread)}
+    shared, plans = _carried_over(side, touches=True, num_actions=2)
+    maps = [
+        PopulationMap(partial(_apply, fn), shared, plans, Layout()) for fn in functions.values()
+    ]
+    ready = [prepare(partial(partial, mapped, shared, plans)) for mapped in maps]
+    times = time_in_turns([each.run for each in ready], scale.repeats)
+    ratios = (None, float(np.median(times[:, 1] / times[:, 0])))
+    steps = _num_steps(side) // 2
+    for name, mapped, each, seconds, ratio in zip(
+        functions, maps, ready, times.T, ratios, strict=True
+    ):
+        yield make_row(
+            "contact_gradient",
+            engine="jaxsimp",
+            body=f"cloth_{side}",
+            population=1,
+            layout=name,
+            steps=steps,
+            ratio_to_forward=ratio,
+            temporary_megabytes=mapped.temporary_bytes / 1e6,
+        ) | measured(each, seconds, side**2 * steps)
+
+
+def _apply(function: Callable[..., Any], shared: Any, actions: Actions) -> Any:
+    return function(actions.displacement, shared, actions.pick)
+
+
+def _spread(displacement: jax.Array, shared: Any, pick: jax.Array) -> jax.Array:
+    """Squared distance of the particles from their start: a cost that depends on every move."""
+    return jnp.sum((_final(shared, Actions(pick, displacement)) - shared[2]) ** 2)
+
+
 def _row(
     side: int, touches: bool, prepared: Prepared, seconds: dict[tuple[int, bool], np.ndarray]
 ) -> Row:
@@ -78,20 +114,24 @@ def _num_steps(side: int) -> int:
 
 def _fold(side: int, touches: bool) -> partial[object]:
     """A rollout that carries two corners over to the other two, and lets go."""
+    shared, plans = _carried_over(side, touches, num_actions=4)
+    return partial(PopulationMap(_final, shared, plans, Layout()), shared, plans)
+
+
+def _carried_over(side: int, touches: bool, num_actions: int) -> tuple[Any, Actions]:
+    """What rollouts of a cloth share, and a plan that folds it in two actions, and then idles."""
     body = cloth((side, side))
     simulation = make_simulation(body, _time_step(side), self_contact=touches)
     pickers = make_pickers((0.2, 0.2, 0.2), steps=_num_steps(side) // 4)
-    moves = np.zeros((4, 2, 3))
+    moves = np.zeros((num_actions, 2, 3))
     moves[:2, :, 0], moves[0, :, 2], moves[1, :, 2] = 0.145, 0.1, -0.094
-    picks = np.full((4, 2), NONE)
+    picks = np.full((num_actions, 2), NONE)
     picks[:2] = [0, side - 1]
     actions = Actions(jnp.asarray(picks), jnp.asarray(moves, dtype=float))
-    start = jnp.asarray(goals.flat(body), dtype=float)
+    shared = simulation, pickers, jnp.asarray(goals.flat(body), dtype=float)
+    return shared, jax.tree.map(lambda each: each[None], actions)
 
-    def final(shared: Any, actions: Actions) -> jax.Array:
-        simulation, pickers, start = shared
-        return rollout(simulation, pickers, at_rest(start), actions)[0].position
 
-    shared = simulation, pickers, start
-    plans = jax.tree.map(lambda each: each[None], actions)
-    return partial(PopulationMap(final, shared, plans, Layout()), shared, plans)
+def _final(shared: Any, actions: Actions) -> jax.Array:
+    simulation, pickers, start = shared
+    return rollout(simulation, pickers, at_rest(start), actions)[0].position
