@@ -78,8 +78,13 @@ def contact_gradient(scale: Scale) -> Iterator[Row]:
         ) | measured(each, seconds, side**2 * steps)
 
 
-def _apply(function: Callable[..., Any], shared: Any, actions: Actions) -> Any:
-    return function(actions.displacement, shared, actions.pick)
+def _mapped(function: Callable[..., Any], shared: Any, plans: Actions) -> PopulationMap:
+    """A function of the moves of a plan, compiled like a population."""
+
+    def one(shared: Any, actions: Actions) -> Any:
+        return function(actions.displacement, shared, actions.pick)
+
+    return PopulationMap(one, shared, plans, Layout())
 
 
 def _spread(displacement: jax.Array, shared: Any, pick: jax.Array) -> jax.Array:
