@@ -54,11 +54,12 @@ def self_contact(scale: Scale) -> Iterator[Row]:
 def contact_gradient(scale: Scale) -> Iterator[Row]:
     """The cost of a gradient through self-contact, of a fold of two actions, and of its value."""
     side = scale.contact_sides[0]
-    functions = {"forward": _spread, "gradient": jax.value_and_grad(_spread)}
+    functions: dict[str, Callable[..., Any]] = {
+        "forward": _spread,
+        "gradient": jax.value_and_grad(_spread),
+    }
     shared, plans = _carried_over(side, touches=True, num_actions=2)
-    maps = [
-        PopulationMap(partial(_apply, fn), shared, plans, Layout()) for fn in functions.values()
-    ]
+    maps = [_mapped(function, shared, plans) for function in functions.values()]
     ready = [prepare(partial(partial, mapped, shared, plans)) for mapped in maps]
     times = time_in_turns([each.run for each in ready], scale.repeats)
     ratios = (None, float(np.median(times[:, 1] / times[:, 0])))
