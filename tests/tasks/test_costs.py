@@ -1,6 +1,6 @@
 """Costs of tasks: in closed form, their symmetries, matching distances, gradients."""
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
