@@ -25,13 +25,19 @@ def has_kernel(name: str, dtype: str) -> bool:
     try:
         kernels.register_kernel(name, dtype)
     except jax.errors.JaxRuntimeError as error:
-        _warn(str(error))
+        _warn_once(str(error))
         return False
     return True
 
 
-@cache
-def _warn(reason: str) -> None:
+_told: list[str] = []
+"""The reason that was told: one warning is enough for all kernels."""
+
+
+def _warn_once(reason: str) -> None:
+    if _told:
+        return
+    _told.append(reason)
     warnings.warn(
         f"self-contact runs without its compiled kernel, many times slower on a CPU: this jaxlib "
         f"({jaxlib.version.__version__}) does not support its interface ({reason})",
