@@ -500,7 +500,7 @@ def laid_over():
     return simulation, make_pickers(steps=20), position, displacement
 
 
-@pytest.mark.usefixtures("x64")
+@pytest.mark.usefixtures("once", "x64")  # both paths are compared with JAX's derivative below
 def test_gradients_through_contact_are_those_of_finite_differences():
     laid_over.cache_clear()
     simulation, pickers, position, displacement = laid_over()
@@ -663,7 +663,7 @@ def test_a_busy_sample_looks_up_for_itself_alone():
 
 @pytest.mark.usefixtures("once")
 def test_a_control_loop_is_a_scan_over_rollouts():
-    """A state goes in and comes out, under vmap and grad; with contact as without."""
+    """A state goes in and comes out, under vmap and grad."""
     simulation, pickers, position, _ = laid_over()
     action = Actions(jnp.asarray([[17, NONE]]), jnp.zeros((1, 2, 3)))
 
@@ -677,13 +677,19 @@ def test_a_control_loop_is_a_scan_over_rollouts():
         final, missed = jax.lax.scan(act, at_rest(position), length=3)
         return final.position[17, 0], missed
 
-    for each in (simulation, replace(simulation, self_contact=None)):
-        run = jax.value_and_grad(partial(cost, each), has_aux=True)
-        (ends, missed), slopes = jax.jit(jax.vmap(run))(jnp.asarray([0.1, 0.3]))
-        assert missed.shape == (2, 3)
-        assert np.all(np.isfinite(slopes))
-        assert np.all(slopes != 0)
-        assert ends[0] != ends[1]
+    run = jax.value_and_grad(partial(cost, simulation), has_aux=True)
+    (ends, missed), slopes = jax.jit(jax.vmap(run))(jnp.asarray([0.1, 0.3]))
+    assert missed.shape == (2, 3)
+    assert np.all(np.isfinite(slopes))
+    assert np.all(slopes != 0)
+    assert ends[0] != ends[1]
+    # The same tree without contact.
+    plain = replace(simulation, self_contact=None)
+    trees = [
+        jax.tree.structure(jax.eval_shape(lambda each=each: settle(each, at_rest(position), 1)))
+        for each in (simulation, plain)
+    ]
+    assert trees[0] == trees[1] == jax.tree.structure(at_rest(position))
 
 
 def test_what_is_compiled_for_a_gpu_calls_nothing_of_a_cpu(path):
