@@ -685,10 +685,7 @@ def test_a_control_loop_is_a_scan_over_rollouts():
     assert ends[0] != ends[1]
     # The same tree without contact.
     plain = replace(simulation, self_contact=None)
-    trees = [
-        jax.tree.structure(jax.eval_shape(lambda each=each: settle(each, at_rest(position), 1)))
-        for each in (simulation, plain)
-    ]
+    trees = [jax.tree.structure(settle(each, at_rest(position), 1)) for each in (simulation, plain)]
     assert trees[0] == trees[1] == jax.tree.structure(at_rest(position))
 
 
