@@ -214,7 +214,9 @@ def test_contacts_last_twice_as_long_where_some_move_and_some_lie_still():
         assert np.any(after.found_at != contacts.found_at) == again
 
 
-@pytest.mark.usefixtures("x64")
+# By kernel alone: compiled as one program, the definition rounds otherwise than operation by
+# operation, and a pair that the first pass has just stopped touches in the second by rounding.
+@pytest.mark.usefixtures("once", "x64")
 @pytest.mark.parametrize("body", [cloth((9, 9), (0.1, 0.1)), rope(60, 0.3)])
 @pytest.mark.parametrize("seed", range(5))
 def test_impulses_and_pushes_are_those_that_jax_differentiates(body, seed):
