@@ -643,6 +643,24 @@ def test_the_adjoint_is_the_derivative_that_jax_takes():
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.usefixtures("once")
+def test_memory_of_a_gradient_grows_with_the_square_root_of_the_steps():
+    simulation, _, start, actions = fold_by_hand(5)
+
+    def memory(steps: int) -> int:
+        pickers = make_pickers((0.2, 0.2, 0.2), steps=steps)
+
+        def cost(displacement):
+            plan = Actions(actions.pick[:1], displacement)
+            return rollout(simulation, pickers, start, plan)[0].position.sum()
+
+        lowered = jax.jit(jax.grad(cost)).lower(actions.displacement[:1])
+        return lowered.compile().memory_analysis().temp_size_in_bytes
+
+    # Sixteen times the steps: four times the states, and something that does not grow.
+    assert memory(1024) <= 4.2 * memory(64)
+
+
 def test_a_busy_sample_looks_up_for_itself_alone():
     """A batch of samples, of which some are due: contacts are those of each by itself."""
     body = cloth((9, 9), (0.1, 0.1))

@@ -13,7 +13,7 @@ their mass among them (mass splitting: Tonge, Benevolenski and Voroshilov, "Mass
 Jitter-Free Parallel Rigid Body Simulation", 2012), so that one parallel pass does not overshoot.
 
 The definition is in JAX, for any device: lookup.py, directions.py, impulses.py. On a CPU the same
-is computed by cpu/kernels.py, compiled by numba, several times as fast.
+is computed by the kernels of cpu/, compiled by numba, several times as fast.
 """
 
 from dataclasses import replace

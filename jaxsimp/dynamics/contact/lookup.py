@@ -1,6 +1,6 @@
 """Lookup of the pairs that may touch: the nearest particle on either side of each.
 
-The definition, in JAX, for any device; cpu/kernels.py finds the same with cells. Distances to all
+The definition, in JAX, for any device; cpu/lookup.py finds the same with cells. Distances to all
 particles are compared in tiles, so that memory grows with the number of particles alone.
 """
 

@@ -93,7 +93,7 @@ def touch_vjp(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
 def _numbers(
     settings: SelfContact, floor: Float[Array, ""], seconds: Float[Array, ""], real: Any
 ) -> Float[Array, " 12"]:
-    """Settings in the order in which kernels.py reads them."""
+    """Settings in the order in which the kernels read them."""
     stretch = jnp.sqrt(1 + settings.squash)
     near = stretch * settings.thickness
     reach = jnp.hypot(settings.lateral, near + stretch * settings.margin)

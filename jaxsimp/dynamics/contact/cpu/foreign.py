@@ -12,8 +12,8 @@ from typing import Any, no_type_check  # numba needs functions as they are, not 
 import jax
 import numpy as np
 
-# numba has no annotations, and mypy does not see the names that it gathers at import.
-from numba import carray, cfunc, njit, types  # type: ignore[attr-defined]
+# numba gathers these names at import, where mypy does not see them.
+from numba import carray, cfunc, njit, types  # type: ignore[attr-defined] # see above
 from numba.extending import intrinsic
 
 MAJOR, MINOR = 0, 3
@@ -111,23 +111,20 @@ WORD = 8
 """Bytes of a pointer and of an `int64_t`: the unit in which structures are read."""
 
 
-def _place(structure: type[ctypes.Structure], *names: str) -> int:
-    """Place of a field, or of a field in a field, in words."""
-    offset = 0
-    for name in names:
-        offset += getattr(structure, name).offset
-        structure = dict(structure._fields_)[name]  # type: ignore[arg-type, assignment]
-    return offset // WORD
+def _place(structure: type[ctypes.Structure], name: str) -> int:
+    """Place of a field, in words."""
+    return int(getattr(structure, name).offset) // WORD
 
 
 FRAME_SIZE = ctypes.sizeof(CallFrame)
 FRAME_EXTENSION = _place(CallFrame, "extension_start")
-FRAME_OPERANDS, FRAME_RESULTS = _place(CallFrame, "args", "args"), _place(CallFrame, "rets", "rets")
+FRAME_OPERANDS = _place(CallFrame, "args") + _place(Args, "args")
+FRAME_RESULTS = _place(CallFrame, "rets") + _place(Rets, "rets")
 BUFFER_WORDS = ctypes.sizeof(Buffer) // WORD
 BUFFER_DATA, BUFFER_RANK, BUFFER_DIMS = (_place(Buffer, name) for name in ("data", "rank", "dims"))
 EXTENSION_TYPE = _place(ExtensionBase, "type")
 EXTENSION_METADATA = _place(MetadataExtension, "metadata")
-METADATA_VERSION = _place(Metadata, "api_version", "major_version")
+METADATA_VERSION = _place(Metadata, "api_version") + _place(ApiVersion, "major_version")
 METADATA_TRAITS = _place(Metadata, "traits")
 OK = 0
 """Result of a handler: no error."""
