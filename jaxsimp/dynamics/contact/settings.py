@@ -22,10 +22,12 @@ SEARCH = 1.5
 SPARE = 1.05
 """Times the thickness that layers are held apart: what presses them pushes them in a little."""
 NEIGHBOURHOOD = 1.25
-"""Particles nearer than this along the body, as a multiple of the longest spring there, do not
+"""Particles nearer than this along the body, as a multiple of the longest spring of each, do not
 touch."""
 DETOUR = 1.1
 """Ratio of the distance along springs to that along the body, at most: 1.08 on a square grid."""
+SLACK = 0.4
+"""Distance that a particle in contact may move until the next lookup, in radii of its disc."""
 AHEAD = 1
 """Look-ahead, in time steps: with more, lookups list more pairs, and their lists last longer."""
 MOST_LAYERS_OF_SHEETS = 1.1
@@ -152,7 +154,7 @@ def make_self_contact(
         thickness=array(SPARE * thickness),
         lateral=array(1.2 * covering),
         margin=array(AHEAD * top_speed * time_step),
-        slack=array(0.4 * covering),
+        slack=array(SLACK * covering),
         squash=array(stretch - 1),
         friction=array(friction),
         is_sheet=is_sheet,
@@ -194,7 +196,7 @@ def _adjacent(body: Body) -> Int[np.ndarray, "N K"]:
     def near(sources: Int[np.ndarray, " _"]) -> Int[np.ndarray, "_ 2"]:
         along = dijkstra(springs, directed=False, indices=sources, limit=DETOUR * own.max())
         rows, others = np.nonzero(np.isfinite(along))
-        limit = np.maximum(own[sources[rows]], own[others])
+        limit = np.minimum(own[sources[rows]], own[others])
         straight = np.linalg.norm(body.rest[sources[rows]] - body.rest[others], axis=1)
         chosen = (along[rows, others] < DETOUR * limit) & (straight < limit)
         return np.stack([sources[rows], others], axis=1)[chosen]
