@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.benchmark.measure import (
-    Prepared,
     Row,
     Scale,
     fit_exponent,

@@ -30,6 +30,8 @@ from jaxsimp.dynamics.contact.impulses import resolve
 from jaxsimp.dynamics.contact.layers import find_contacts, touch
 from jaxsimp.dynamics.contact.settings import (
     AHEAD,
+    FEW,
+    LEVEL,
     MOST_LAYERS_OF_ROPES,
     SEARCH,
     SPARE,
@@ -188,6 +190,77 @@ def test_contacts_are_looked_up_again_when_one_moves_too_far_among_the_others(co
         settings, contacts, nothing, zero, zero, jnp.asarray(moved), 0 * position, passes=0
     )
     assert np.any(after.found_at != contacts.found_at) == again
+
+
+def by_side(settings, position: np.ndarray) -> np.ndarray:
+    """Squared distances as the search measures them; infinite on the other side: (2, N, N)."""
+    away = (position[:, None] - position[:, :, None]).astype(np.float64)
+    normal = np.asarray(across(settings, jnp.asarray(position)), dtype=np.float64)
+    above = (normal[:, :, None] * away).sum(axis=0) if settings.is_sheet else away[2]
+    measured = (away**2).sum(axis=0) + np.asarray(settings.squash)[:, None] * above**2
+    measured[~settings.may_touch | (measured >= np.square(reach_of(settings))[:, None])] = np.inf
+    level = LEVEL * float(settings.thickness)
+    return np.stack([np.where(side * above < -level, np.inf, measured) for side in (1, -1)])
+
+
+def reach_of(settings) -> np.ndarray:
+    stretch = np.sqrt(1 + np.asarray(settings.squash, dtype=np.float64))
+    near = float(settings.thickness) + float(settings.margin)
+    return np.hypot(float(settings.lateral.max()), stretch * near)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("body", [cloth((11, 11), (0.1, 0.1)), rope(60, 0.3)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_few_that_moved_are_looked_up_alone(body, seed):
+    settings, rng = make_self_contact(body, 1e-3), np.random.default_rng(seed)
+    before = crumpled(body, seed, 0.05).astype(np.float64)
+    contacts = find_contacts(settings, jnp.asarray(before), ZERO)
+    count, after = body.num_particles, before.copy()
+    due = rng.choice(count, count // FEW, replace=False)
+    # Half of them go far away, and half a little farther than they may.
+    step = np.asarray(contacts.allowance)[due] * np.where(np.arange(len(due)) % 2, 1.01, 8.0)
+    along = rng.normal(size=(3, len(due)))
+    after[:, due] += step * along / np.linalg.norm(along, axis=0)
+    nothing, position = jnp.zeros(count), jnp.asarray(after)
+    *_, found = touch(settings, contacts, nothing, ZERO, ZERO, position, 0 * position, passes=0)
+    distances, ids = by_side(settings, after), np.arange(count)
+    least, farthest = distances.min(axis=2), np.square(reach_of(settings))[None]
+    nearest = np.where(np.isfinite(least), distances.argmin(axis=2), ids[None])
+    whole, some = np.minimum(least, farthest), distances[:, :, np.sort(due)]
+    # Of the others: what they had, and what moved.
+    had, known = np.asarray(contacts.nearest), np.asarray(contacts.distance).copy()
+    known[np.isin(had, due)] = np.inf
+    offered = some.min(axis=2)
+    others = np.where(offered < known, np.sort(due)[some.argmin(axis=2)], had)
+    kept = np.minimum(known, offered)
+    limit = np.sqrt(contacts.distance) + np.asarray(settings.slack)
+    compared = (kept > np.maximum(limit**2, contacts.distance)).any(axis=0)
+    assert compared.any()
+    assert (offered < known).any()
+    compared[due] = True
+    expected = np.where(compared, nearest, others)
+    np.testing.assert_array_equal(found.nearest, expected)
+    np.testing.assert_allclose(found.distance, np.where(compared, whole, kept), rtol=1e-12)
+    np.testing.assert_array_equal(found.found_at[:, due], after[:, due])
+    still = np.setdiff1d(ids, due)
+    np.testing.assert_array_equal(found.found_at[:, still], before[:, still])
+    assert np.all(found.allowance[still] <= contacts.allowance[still])
+    # Any two may come nearer by what both may move, and do not touch but by twice the slack.
+    room = np.asarray(found.allowance) - np.linalg.norm(after - found.found_at, axis=0)
+    apart = np.linalg.norm(after[:, None] - after[:, :, None], axis=0)
+    touching = np.hypot(
+        float(settings.lateral.max()),
+        np.sqrt(1 + np.asarray(settings.squash)) * float(settings.thickness),
+    )
+    spare = np.maximum(apart - np.maximum(touching, touching[:, None]), 0.0)
+    squashed = (np.sqrt(by_side(settings, after).min(axis=0)) - touching[:, None]) / np.sqrt(
+        1 + np.asarray(settings.squash)
+    )[:, None]
+    free = np.maximum(spare, np.where(np.isfinite(squashed), squashed, 0.0))
+    allowed = np.maximum(np.maximum(free, free.T), 2 * float(settings.slack.max()))
+    pairs = settings.may_touch[due]
+    assert np.all((room[due][:, None] + room[None] <= allowed[due] + 1e-9)[pairs])
 
 
 def test_contacts_last_twice_as_long_where_some_move_and_some_lie_still():
@@ -710,10 +783,10 @@ def test_a_busy_sample_looks_up_for_itself_alone():
         return touch(settings, contacts, nothing, ZERO, ZERO, position, 0 * position, passes=0)[2]
 
     found = jax.jit(jax.vmap(one))(moved)
-    np.testing.assert_array_equal(found.renewed, [False, True, False, True])
+    np.testing.assert_array_equal(found.renewed.any(axis=(1, 2)), [False, True, False, True])
     for index, position in enumerate(moved):
         alone = one(position)
-        for name in ("partner", "listed_by", "found_at", "allowance"):
+        for name in ("nearest", "distance", "partner", "listed_by", "found_at", "allowance"):
             np.testing.assert_allclose(getattr(found, name)[index], getattr(alone, name), atol=1e-7)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from jaxsimp.dynamics.contact.cpu.foreign import compiled
+from jaxsimp.dynamics.contact.settings import FEW
 
 LANES = 16
 """Particles that are compared at a time."""
@@ -27,35 +28,102 @@ FAR = np.float32(1e4)
 
 @compiled
 @no_type_check
-def gone_too_far(position, found_at, allowance):
-    """Whether any has, from where it was found, or from there moved along with the others.
+def look_up(
+    position,
+    nearest,
+    distance,
+    partner,
+    listed_by,
+    direction,
+    found_at,
+    allowance,
+    renewed,
+    numbers,
+    sizes,
+    frame,
+    adjacent,
+    is_sheet,
+):
+    """Look up the particles that moved too far, or all; list pairs, and find their directions."""
+    renewed[:] = False
+    real, count = position[0].dtype.type, len(allowance)
+    if _num_beyond(position, found_at, allowance, real(0), real(0), real(0)) == 0:
+        return
+    due, is_due = np.empty(count, np.uint32), np.empty(count, np.bool_)
+    num_due = _find_due(position, found_at, allowance, due, is_due)
+    if num_due == 0:
+        return
+    across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
+    if num_due * FEW > count:
+        _find_all(
+            *(position, nearest, distance, found_at, allowance, numbers, sizes, frame, adjacent),
+            *(is_sheet, across, known),
+        )
+        is_due[:] = True
+        changed = True
+    else:
+        changed = _find_some(
+            *(due[:num_due], is_due, position, nearest, distance, found_at, allowance, numbers),
+            *(sizes, frame, adjacent, is_sheet, across, known),
+        )
+    if changed:
+        _list_pairs(nearest, partner, listed_by, renewed)
+    level = numbers[4]
+    for k in range(2):
+        for i in range(count):
+            j = partner[k, i]
+            if j != i and (renewed[k, i] | is_due[i] | is_due[j]):
+                renewed[k, i] = True
+                _find_across(i, position, frame, is_sheet, across, known)
+                _find_across(j, position, frame, is_sheet, across, known)
+                _direct(i, j, k, position, across, is_sheet, level, direction)
 
-    What all have in common brings none nearer to another. Where some move and some lie still,
-    half of it is common to all.
-    """
-    zero = allowance.dtype.type(0)
-    if not _any_beyond(position, found_at, allowance, zero, zero, zero):
-        return False
+
+@njit(inline="always")
+@no_type_check
+def _find_due(position, found_at, allowance, due, is_due):
+    """List and mark those that moved too far, see ../lookup.py; returns their number."""
     x, y, z = (
         _middle_of_moves(position[0], found_at[0]),
         _middle_of_moves(position[1], found_at[1]),
         _middle_of_moves(position[2], found_at[2]),
     )
-    return _any_beyond(position, found_at, allowance, x, y, z)
+    zero, number = allowance.dtype.type(0), np.uint32(0)
+    alone = _num_beyond(position, found_at, allowance, zero, zero, zero)
+    along = _num_beyond(position, found_at, allowance, x, y, z)
+    if along == 0:
+        return number
+    if along >= alone:
+        x, y, z = zero, zero, zero
+    for place in range(len(allowance)):
+        i = np.uint32(place)
+        found_at[0, i] += x
+        found_at[1, i] += y
+        found_at[2, i] += z
+        dx, dy, dz = (
+            position[0][i] - found_at[0, i],
+            position[1][i] - found_at[1, i],
+            position[2][i] - found_at[2, i],
+        )
+        is_due[i] = not dx * dx + dy * dy + dz * dz <= allowance[i] * abs(allowance[i])
+        due[number] = i
+        number += np.uint32(is_due[i])
+    return number
 
 
 @njit(inline="always")
 @no_type_check
-def _any_beyond(position, found_at, allowance, common_x, common_y, common_z):
-    beyond = False
+def _num_beyond(position, found_at, allowance, common_x, common_y, common_z):
+    """Number of particles that moved farther than allowed, apart from what all moved."""
+    number = np.int32(0)
     for i in range(len(allowance)):
         x, y, z = (
             position[0][i] - found_at[0, i] - common_x,
             position[1][i] - found_at[1, i] - common_y,
             position[2][i] - found_at[2, i] - common_z,
         )
-        beyond |= not x * x + y * y + z * z <= allowance[i] * abs(allowance[i])
-    return beyond
+        number += np.int32(not x * x + y * y + z * z <= allowance[i] * abs(allowance[i]))
+    return number
 
 
 @njit(inline="always")
@@ -97,11 +165,10 @@ def _range_of(values):
 
 @compiled
 @no_type_check
-def find_pairs(
+def _find_all(
     position,
-    partner,
-    listed_by,
-    direction,
+    nearest,
+    distance,
     found_at,
     allowance,
     numbers,
@@ -109,25 +176,25 @@ def find_pairs(
     frame,
     adjacent,
     is_sheet,
+    across,
+    known,
 ):
-    """Look up the nearest on either side of each, and the directions of their contacts."""
+    """Compare all with all that are near, by cells; each pair once."""
     real = position[0].dtype.type
     count, half = len(position[0]), real(0.5)
     slack, squash, touching, reach = sizes[1], sizes[2], sizes[3], sizes[4]
     level, search = numbers[4], numbers[5]
     order, place_of, start, rows, columns = _sorted_into_cells(position, search)
-    across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
     search = search * search
     clear = np.full(count, search, real)
-    nearest, farthest = np.empty((2, count), real), real(0)
-    best = np.empty((2, count), np.uint32)
+    farthest = real(0)
     points = np.full((3, count + LANES), real(np.nan))  # After the last: near to nothing.
     marks = np.zeros(count + LANES, np.uint32)
     for place in range(count):
         i = order[place]
-        best[0, i] = best[1, i] = i
-        nearest[0, i] = nearest[1, i] = reach[i] * reach[i]
-        farthest = max(farthest, nearest[0, i])
+        nearest[0, i] = nearest[1, i] = i
+        distance[0, i] = distance[1, i] = reach[i] * reach[i]
+        farthest = max(farthest, distance[0, i])
         for axis in range(3):
             points[axis, place] = position[axis][i]
     # Each pair is met in the row of one that comes later, or in the next row.
@@ -160,47 +227,174 @@ def find_pairs(
                             clear[i], clear[j] = min(clear[i], squared), min(clear[j], squared)
                             if squared >= farthest:
                                 continue
-                            for each in (i, j):
-                                if not known[each]:
-                                    known[each] = True
-                                    across[each] = _across(each, position, frame, is_sheet)
+                            _find_across(i, position, frame, is_sheet, across, known)
+                            _find_across(j, position, frame, is_sheet, across, known)
                             above = _height(i, x, y, z, is_sheet, across)
-                            _compare(i, j, above, squared, level, squash, nearest, best)
+                            _compare(i, j, above, squared, level, squash, nearest, distance)
                             above = -_height(j, x, y, z, is_sheet, across)
-                            _compare(j, i, above, squared, level, squash, nearest, best)
-    above, below = nearest[0], nearest[1]
+                            _compare(j, i, above, squared, level, squash, nearest, distance)
+    above, below = distance[0], distance[1]
     for place in range(count):
         i = np.uintp(place)
-        closest, stretch = sqrt(min(above[i], below[i])), sqrt(real(1) + squash[i])
-        # What is beside a particle may come nearer by its distance, what is above by less.
-        free = max((closest - touching[i]) / stretch, sqrt(clear[i]) - touching[i])
+        free = _free(min(above[i], below[i]), clear[i], touching[i], squash[i])
         allowance[i] = max(slack[i], half * free)
     for axis in range(3):
         found_at[axis] = position[axis]
-    _list_pairs(position, best, across, partner, listed_by, direction, level, is_sheet)
 
 
 @compiled
 @no_type_check
-def _list_pairs(position, best, across, partner, listed_by, direction, level, is_sheet):
-    """List each particle and its nearest on a side, each pair once, with its direction."""
-    count, capacity = best.shape[1], len(listed_by)
+def _find_some(
+    due,
+    is_due,
+    position,
+    nearest,
+    distance,
+    found_at,
+    allowance,
+    numbers,
+    sizes,
+    frame,
+    adjacent,
+    is_sheet,
+    across,
+    known,
+):
+    """Compare those that are due with all, and then those whose nearest has gone away.
+
+    Returns whether any particle has another nearest. Marks as due what was compared.
+    """
+    real, count = position[0].dtype.type, len(allowance)
+    slack, squash, touching, reach = sizes[1], sizes[2], sizes[3], sizes[4]
+    level, search, half = numbers[4], numbers[5] * numbers[5], real(0.5)
+    points = np.full((3, count + LANES), real(np.nan))  # After the last: near to nothing.
+    for axis in range(3):
+        points[axis, :count] = position[axis]
+    marks = np.zeros(count + LANES, np.uint32)
+    ids, squares = np.empty(count, np.uint32), np.empty(count, real)
+    # To the nearest that is due: squared distances, and as the search measures them.
+    clear, offered = np.full(count, search, real), reach * reach
+    before, changed, rows = distance.copy(), False, due
+    for k in range(2):
+        for i in range(count):
+            if is_due[nearest[k, i]]:
+                distance[k, i] = real(np.inf)
+    for turn in range(2):
+        for row in range(len(rows)):
+            i, mark = rows[row], np.uint32(turn * count + row + 1)
+            for each in range(adjacent.shape[1]):
+                marks[adjacent[i, each]] = mark
+            number = 0
+            for block in range(0, count, LANES):
+                near = _near(points, marks, i, block, mark, search)
+                while near:
+                    j = block + _lowest(near)
+                    near &= near - np.uint32(1)
+                    x, y, z = (
+                        points[0, j] - points[0, i],
+                        points[1, j] - points[1, i],
+                        points[2, j] - points[2, i],
+                    )
+                    ids[number], squares[number] = j, x * x + y * y + z * z
+                    number += 1
+            had_above, had_below, own_clear = nearest[0, i], nearest[1, i], search
+            nearest[0, i] = nearest[1, i] = i
+            distance[0, i] = distance[1, i] = reach[i] * reach[i]
+            for place in range(number):
+                j, squared = ids[place], squares[place]
+                own_clear = min(own_clear, squared)
+                if squared < reach[i] * reach[i]:
+                    _find_across(i, position, frame, is_sheet, across, known)
+                    above = _height_of(j, i, points, is_sheet, across)
+                    _compare(i, j, above, squared, level, squash, nearest, distance)
+            changed |= (nearest[0, i] != had_above) | (nearest[1, i] != had_below)
+            if turn == 1:
+                continue
+            free = _free(min(distance[0, i], distance[1, i]), own_clear, touching[i], squash[i])
+            allowance[i] = max(slack[i], half * free)
+            for place in range(number):
+                j, squared = ids[place], squares[place]
+                if is_due[j]:
+                    continue
+                clear[j] = min(clear[j], squared)
+                if squared < reach[j] * reach[j]:
+                    _find_across(j, position, frame, is_sheet, across, known)
+                    above = _height_of(i, j, points, is_sheet, across)
+                    far = squared + squash[j] * above * above
+                    if far < reach[j] * reach[j]:
+                        had_above, had_below = nearest[0, j], nearest[1, j]
+                        offered[j] = min(offered[j], far)
+                        _compare(j, i, above, squared, level, squash, nearest, distance)
+                        changed |= (nearest[0, j] != had_above) | (nearest[1, j] != had_below)
+        if turn == 0:
+            lost, num_lost = np.empty(count, np.uint32), np.uint32(0)
+            for place in range(count):
+                i = np.uint32(place)
+                lost[num_lost] = i
+                num_lost += np.uint32(
+                    not is_due[i]
+                    and (
+                        _lost(before[0, i], distance[0, i], slack[i])
+                        or _lost(before[1, i], distance[1, i], slack[i])
+                    )
+                )
+            rows = lost[:num_lost]
+    for i in range(count):
+        if clear[i] < search:
+            free = _free(offered[i], clear[i], touching[i], squash[i])
+            x, y, z = (
+                position[0][i] - found_at[0, i],
+                position[1][i] - found_at[1, i],
+                position[2][i] - found_at[2, i],
+            )
+            within = sqrt(x * x + y * y + z * z) + max(slack[i], half * free)
+            allowance[i] = min(allowance[i], within)
+    for i in due:
+        for axis in range(3):
+            found_at[axis, i] = position[axis][i]
+    for i in rows:
+        is_due[i] = True
+    return changed
+
+
+@njit(inline="always")
+@no_type_check
+def _lost(before, now, slack):
+    """Whether a particle's nearest is farther than before by more than its slack."""
+    if now <= before:
+        return False
+    limit = sqrt(before) + slack
+    return now > limit * limit
+
+
+@njit(inline="always")
+@no_type_check
+def _free(stretched, clear, touching, squash):
+    """What is beside a particle may come nearer by its distance, what is above by less."""
+    stretch = sqrt(np.float32(1) + squash)
+    return max((sqrt(stretched) - touching) / stretch, sqrt(clear) - touching)
+
+
+@compiled
+@no_type_check
+def _list_pairs(nearest, partner, listed_by, renewed):
+    """List each particle and its nearest on a side, each pair once; mark the slots that change."""
+    count, capacity = nearest.shape[1], len(listed_by)
     num_listings = np.zeros(count, np.int64)
     listed_by[:] = 2 * count
     for i in range(count):
-        above, below = best[0, i], best[1, i]
+        above, below = nearest[0, i], nearest[1, i]
         for k in range(2):
-            j = best[k, i]
+            j = nearest[k, i]
             # Not those that have been met from the other side.
-            met = j < i and (best[0, j] == i or best[1, j] == i)
-            partner[k, i] = i
-            direction[0, k, i], direction[1, k, i], direction[2, k, i] = 0, 0, 1
-            if j == i or met or (k == 1 and below == above) or num_listings[j] == capacity:
-                continue
+            met = j < i and (nearest[0, j] == i or nearest[1, j] == i)
+            if met or (k == 1 and below == above) or (j != i and num_listings[j] == capacity):
+                j = i
+            if j != i:
+                listed_by[num_listings[j], j] = k * count + i
+                num_listings[j] += 1
+            renewed[k, i] = j != partner[k, i]
             partner[k, i] = j
-            listed_by[num_listings[j], j] = k * count + i
-            num_listings[j] += 1
-            _direct(i, j, k, position, across, is_sheet, level, direction)
 
 
 @njit(inline="always")
@@ -314,16 +508,33 @@ def _height(i, dx, dy, dz, is_sheet, across):
 
 @njit(inline="always")
 @no_type_check
-def _compare(i, j, above, squared, level, squash, nearest, best):
+def _height_of(j, i, points, is_sheet, across):
+    """Height of j over the sheet at i."""
+    x, y, z = points[0, j] - points[0, i], points[1, j] - points[1, i], points[2, j] - points[2, i]
+    return _height(i, x, y, z, is_sheet, across)
+
+
+@njit(inline="always")
+@no_type_check
+def _find_across(i, position, frame, is_sheet, across, known):
+    """Write the unit normal of the sheet, or tangent of the rope, at a particle, if need be."""
+    if not known[i]:
+        known[i] = True
+        across[i] = _across(i, position, frame, is_sheet)
+
+
+@njit(inline="always")
+@no_type_check
+def _compare(i, j, above, squared, level, squash, nearest, distance):
     """Whether j, that far above i, is the nearest so far on one side of i, or on both."""
     squared = squared + squash[i] * above * above
     # Selections, not branches: which way they go is anybody's guess.
-    is_best = (above >= -level) & (squared < nearest[0, i])
-    nearest[0, i] = squared if is_best else nearest[0, i]
-    best[0, i] = j if is_best else best[0, i]
-    is_best = (above <= level) & (squared < nearest[1, i])
-    nearest[1, i] = squared if is_best else nearest[1, i]
-    best[1, i] = j if is_best else best[1, i]
+    is_best = (above >= -level) & (squared < distance[0, i])
+    distance[0, i] = squared if is_best else distance[0, i]
+    nearest[0, i] = j if is_best else nearest[0, i]
+    is_best = (above <= level) & (squared < distance[1, i])
+    distance[1, i] = squared if is_best else distance[1, i]
+    nearest[1, i] = j if is_best else nearest[1, i]
 
 
 @compiled
