@@ -53,7 +53,7 @@ def _touch_float64(frame):
     return OK
 
 
-@compiled
+@njit(inline="always")
 @no_type_check
 def _touch(sources, targets, real):
     position, velocity = matrix(targets[0], real), matrix(targets[1], real)
@@ -73,11 +73,23 @@ def _touch(sources, targets, real):
     here, speed = _rows(position, halo), _rows(velocity, halo)
     if passes > 0:
         missed[0] += resolve(
-            *(here, speed, partner, direction, carried, inverse_mass, sizes[0], numbers, passes)
+            here, speed, partner, direction, carried, inverse_mass, sizes[0], numbers, passes
         )
     look_up(
-        *(here, nearest, distance, partner, listed_by, direction, found_at, allowance, renewed),
-        *(numbers, sizes, frame, adjacent, is_sheet),
+        here,
+        nearest,
+        distance,
+        partner,
+        listed_by,
+        direction,
+        found_at,
+        allowance,
+        renewed,
+        numbers,
+        sizes,
+        frame,
+        adjacent,
+        is_sheet,
     )
 
 

@@ -26,7 +26,7 @@ FAR = np.float32(1e4)
 """What is farther away than this, metres, has no say in where cells are."""
 
 
-@compiled
+@njit(inline="always")
 @no_type_check
 def look_up(
     position,
@@ -56,15 +56,37 @@ def look_up(
     across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
     if num_due * FEW > count:
         _find_all(
-            *(position, nearest, distance, found_at, allowance, numbers, sizes, frame, adjacent),
-            *(is_sheet, across, known),
+            position,
+            nearest,
+            distance,
+            found_at,
+            allowance,
+            numbers,
+            sizes,
+            frame,
+            adjacent,
+            is_sheet,
+            across,
+            known,
         )
         is_due[:] = True
         changed = True
     else:
         changed = _find_some(
-            *(due[:num_due], is_due, position, nearest, distance, found_at, allowance, numbers),
-            *(sizes, frame, adjacent, is_sheet, across, known),
+            due[:num_due],
+            is_due,
+            position,
+            nearest,
+            distance,
+            found_at,
+            allowance,
+            numbers,
+            sizes,
+            frame,
+            adjacent,
+            is_sheet,
+            across,
+            known,
         )
     if changed:
         _list_pairs(nearest, partner, listed_by, renewed)
