@@ -1,0 +1,189 @@
+"""A T-shirt of two sheets: dropped, folded and differentiated; front and back stay apart."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from experiments.physics.two_sheets import (
+    fold_line,
+    folded,
+    from_seam,
+    gaps_of_layers,
+    heights,
+    in_the_air,
+    is_front,
+    on_seam,
+    settled,
+    shirt,
+    simulation_of,
+)
+from jaxsimp.bodies import Body, Garment
+from jaxsimp.dynamics import Actions, at_rest, make_pickers, make_simulation, rollout
+
+CREASE, SEAM = 0.03, 0.02
+"""Distances from the fold's line and from seams within which triangles may cross, metres."""
+
+
+def may_touch(body: Body) -> np.ndarray:
+    """Pairs that are no neighbours along the surface, shape (N, N).
+
+    By the shortest way along springs: at least 1.25 times the longest spring of either particle,
+    and two thicknesses.
+    """
+    count = body.num_particles
+    weights = (body.rest_length, tuple(body.springs.T))
+    way = dijkstra(coo_array(weights, shape=(count, count)).tocsr(), directed=False)
+    longest = np.zeros(count)
+    np.maximum.at(longest, body.springs, body.rest_length[:, None])
+    reach = 1.25 * np.maximum(longest[:, None], longest[None])
+    return way >= np.maximum(reach, 2 * body.material.thickness)
+
+
+def closest(garment: Garment, position: np.ndarray) -> float:
+    """Distance of the closest pair that may touch, in thicknesses."""
+    distances = np.linalg.norm(position[:, None] - position[None], axis=-1)
+    return distances[may_touch(garment.body)].min() / garment.body.material.thickness
+
+
+def inside_out(garment: Garment, position: np.ndarray) -> float:
+    """Of the pairs of front and back that may touch, the fraction whose front is behind the back.
+
+    Behind is where the triangles of the back face.
+    """
+    faces = garment.body.faces
+    a, b, c = position[faces].transpose(1, 0, 2)
+    normal = np.zeros_like(position)
+    np.add.at(normal, faces, np.cross(b - a, c - a)[:, None])
+    back = np.flatnonzero(~is_front(garment))
+    back = back[may_touch(garment.body)[back, garment.opposite[back]]]
+    away = position[garment.opposite[back]] - position[back]
+    return float(((normal[back] * away).sum(axis=1) > 0).mean())
+
+
+def test_the_neighbourhood_of_a_seam_is_one_row_of_particles_wide():
+    """Front and back next to the seam are neighbours round it; farther off they may touch."""
+    for num_particles in (800, 3600):
+        garment = shirt(num_particles)
+        body, flat = garment.body, garment.body.rest[:, :2]
+        away = from_seam(garment, flat, flat)[~on_seam(garment)]
+        touches = may_touch(body)[np.arange(len(flat)), garment.opposite][~on_seam(garment)]
+        edge = np.median(body.rest_length[body.families == 0])
+        assert not touches[away < 0.8 * edge].any()
+        assert touches[away > 1.6 * edge].all()
+
+
+def drops(garment: Garment, seeds: range, **options: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Closest pair, and fraction inside out, of T-shirts that were dropped 2 s ago."""
+    simulation = simulation_of(garment, **options)
+    found = []
+    for seed in seeds:
+        start = in_the_air(garment, seed)
+        assert 0.05 < start[:, 2].min() < 0.11
+        assert closest(garment, start) > 0.98
+        assert inside_out(garment, start) == 0
+        position = settled(simulation, start, 2.0)
+        assert position[:, 2].min() < 1.01 * garment.body.radius  # on the table
+        found.append((closest(garment, position), inside_out(garment, position)))
+    near, wrong = np.transpose(found)
+    return near, wrong
+
+
+def test_front_and_back_of_a_dropped_t_shirt_hold_each_other_apart():
+    garment = shirt(800)
+    near, wrong = drops(garment, range(4))
+    assert (near >= 0.8).sum() >= 3
+    assert wrong.max() < 0.05
+    # Without contact they lie in one plane.
+    near, _ = drops(garment, range(1), self_contact=False)
+    assert near < 0.1
+
+
+@pytest.mark.slow
+def test_dropped_t_shirts_settle_with_no_particles_closer_than_their_thickness_allows():
+    near, wrong = drops(shirt(1600), range(20))
+    assert (near >= 0.8).sum() >= 19
+    assert near.min() > 0.5
+    assert wrong.max() < 0.05
+
+
+def test_heights_of_a_layer_are_those_of_its_triangles():
+    """A plane, z = 0.1 + 0.2 x - 0.3 y, over a square less one of its halves."""
+    corners = np.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.3], [0.0, 1.0, -0.2]])
+    points = np.array([[0.2, 0.3], [0.6, 0.6], [0.0, 0.9], [-0.1, 0.2]])
+    found = heights(np.array([[0, 2, 1]]), corners, points)
+    np.testing.assert_allclose(found, [0.05, np.nan, -0.17, np.nan])
+
+
+def check_fold(garment: Garment, least: float) -> None:
+    """Four layers, in order everywhere but at the crease and at seams, there too in most places."""
+    position = folded(garment, simulation_of(garment))
+    points, gaps = gaps_of_layers(garment, position)
+    gaps /= garment.body.material.thickness
+    seams = from_seam(garment, position[:, :2], points)
+    away = (points[:, 1] > fold_line(garment) + CREASE) & (seams > SEAM)
+    # Half of the T-shirt is turned over, less what is near its edges.
+    width, length = np.ptp(garment.body.rest[:, :2], axis=0)
+    assert 1e-4 * away.sum() > 0.1 * width * length
+    assert closest(garment, position) > 0.8
+    assert (gaps[:, away] > 0).all()
+    # Particles are held 1.05 thicknesses apart; triangles between them sag.
+    assert (gaps[:, away] > 0.8).mean() > 0.99
+    np.testing.assert_allclose(np.median(gaps[:, away], axis=1), 1.05, atol=0.02)
+    assert (gaps > 0).all(axis=0).mean() > least
+
+
+def test_four_layers_of_a_folded_doll_shirt_lie_in_order():
+    check_fold(shirt(900, 0.5), least=0.9)
+
+
+@pytest.mark.slow
+def test_four_layers_of_a_folded_t_shirt_lie_in_order():
+    check_fold(shirt(3600), least=0.95)
+
+
+# Differentiated
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("seed", range(3))
+def test_gradients_through_contact_of_two_sheets_equal_differences(seed):
+    """From the air: at rest, where layers touch with no gap, who is in contact is undecided."""
+    garment = shirt(200, 0.5)
+    body, landmarks = garment.body, garment.landmarks
+    simulation = make_simulation(body, 1e-3, self_contact=True)
+    pickers = make_pickers(steps=20)
+    rng = np.random.default_rng(seed)
+    picks = jnp.asarray([[landmarks["neck"], landmarks["left_hem"]]] * 2)
+    position = jnp.asarray(in_the_air(garment, seed))
+    displacement = jnp.asarray(rng.uniform(-0.02, 0.02, (2, 2, 3)))
+    weights = jnp.asarray(rng.standard_normal((2, body.num_particles, 3)))
+
+    def cost(simulation, position, displacement):
+        actions = Actions(picks, displacement)
+        final = rollout(simulation, pickers, at_rest(position), actions)[0]
+        return jnp.sum(weights[0] * final.position) + jnp.sum(weights[1] * final.velocity) / 100
+
+    # Compiled quickly: most of the time goes into that.
+    jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+    arguments = position, displacement
+    value = jit(partial(cost, simulation))
+    gradients = jit(jax.grad(partial(cost, simulation), (0, 1)))(*arguments)
+    free = jit(partial(cost, replace(simulation, self_contact=None)))(*arguments)
+    assert abs(free - value(*arguments)) > 1e-3  # they touch
+    step = 1e-9
+    for place in range(2):
+        along = [np.zeros(each.shape) for each in arguments]
+        along[place] = rng.standard_normal(along[place].shape)
+        ahead, behind = (
+            value(*(a + sign * step * d for a, d in zip(arguments, along, strict=True)))
+            for sign in (1, -1)
+        )
+        expected = np.vdot(gradients[place], along[place])
+        # Rounding of the difference, 1e-15 / 1e-9, against gradients of order 1 to 100.
+        np.testing.assert_allclose((ahead - behind) / (2 * step), expected, rtol=1e-5)
