@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from experiments.physics.measure import Positions, run
 from jaxsimp import goals
@@ -70,36 +70,36 @@ def over(way: Float[np.ndarray, "3"], lift: float, gap: float) -> Float[np.ndarr
 # --- distances -----------------------------------------------------------------------------------
 
 
-def nearest_particles(body: Body, position: Positions, adjacent: float) -> Float[np.ndarray, " N"]:
+def nearest_particles(
+    body: Body, position: Positions, may_touch: Bool[np.ndarray, "N N"]
+) -> Float[np.ndarray, " N"]:
     """Distance from each particle to the nearest one that can touch it, metres.
 
     Args:
         body: a sheet.
         position: positions, metres.
-        adjacent: rest distance, metres, below which particles do not touch.
+        may_touch: pairs of particles that are not adjacent.
     """
-    return np.where(_may_touch(body, adjacent), _distances(position), np.inf).min(axis=1)
+    return np.where(may_touch, _distances(position), np.inf).min(axis=1)
 
 
-def nearest_triangles(body: Body, position: Positions, adjacent: float) -> Float[np.ndarray, " N"]:
+def nearest_triangles(
+    body: Body, position: Positions, may_touch: Bool[np.ndarray, "N N"]
+) -> Float[np.ndarray, " N"]:
     """Distance from each particle to the nearest triangle whose corners can all touch it, metres.
 
     Args:
         body: a sheet.
         position: positions, metres.
-        adjacent: rest distance, metres, below which particles do not touch.
+        may_touch: pairs of particles that are not adjacent.
     """
     from trimesh.triangles import closest_point
 
-    particle, face = np.nonzero(_may_touch(body, adjacent)[:, body.faces].all(axis=2))
+    particle, face = np.nonzero(may_touch[:, body.faces].all(axis=2))
     closest = closest_point(position[body.faces[face]], position[particle])
     found = np.full(len(position), np.inf)
     np.minimum.at(found, particle, np.linalg.norm(closest - position[particle], axis=1))
     return found
-
-
-def _may_touch(body: Body, adjacent: float) -> np.ndarray:
-    return _distances(body.rest) > adjacent
 
 
 def _distances(points: Positions) -> Float[np.ndarray, "N N"]:
@@ -185,7 +185,7 @@ def _draw_distances(axes: "Axes", body: Body, position: Positions, name: str, co
         ("-", "particle", nearest_particles),
         ("--", "triangle", nearest_triangles),
     ):
-        found = measure(body, position, float(touching.adjacent)) / (2 * body.radius)
+        found = measure(body, position, touching.may_touch) / (2 * body.radius)
         axes.ecdf(found, color=color, ls=line, label=f"{name.split()[0]}, {what}")
         words.append(
             f"nearest {what} at least {found.min():.2f} and in the median {np.median(found):.2f} "

@@ -77,11 +77,8 @@ def two_pieces(first: Body, second: Body, **changes) -> Body:
 def colliding_distances(simulation: Simulation, position: np.ndarray) -> np.ndarray:
     """Distances of all pairs that may touch, by brute force, in float64."""
     position = np.asarray(position, dtype=np.float64)
-    apart = np.asarray(simulation.self_contact.apart, dtype=np.float64).T
-    now, rest = (
-        np.linalg.norm(points[:, None] - points[None], axis=-1) for points in (position, apart)
-    )
-    return now[rest > float(simulation.self_contact.adjacent)]
+    now = np.linalg.norm(position[:, None] - position[None], axis=-1)
+    return now[simulation.self_contact.may_touch]
 
 
 # Who is near
@@ -114,21 +111,17 @@ def test_pairs_are_the_nearest_of_all(body, size):
     settings = make_self_contact(body, 1e-3)
     position = crumpled(body, 0, size)
     contacts = find_contacts(settings, jnp.asarray(position), ZERO)
-    count, squash = body.num_particles, float(settings.squash)
+    count, squash = body.num_particles, np.asarray(settings.squash)[:, None]
     normal = np.asarray(across(settings, jnp.asarray(position)))
     if not settings.is_sheet:
         normal = np.tile([[0.0], [0.0], [1.0]], count)
     away = (position[:, None] - position[:, :, None]).astype(np.float64)
     above = (normal[:, :, None] * away).sum(axis=0)
     true = np.sqrt((away**2).sum(axis=0) + squash * above**2)
-    apart = np.asarray(settings.apart)
-    rest = np.linalg.norm(apart[:, None] - apart[:, :, None], axis=0)
-    true[rest < float(settings.adjacent)] = np.inf
+    true[~settings.may_touch] = np.inf
     thickness = float(settings.thickness)
-    reach = np.hypot(
-        float(settings.lateral),
-        np.sqrt(1 + squash) * (thickness + float(settings.margin)),
-    )
+    stretch, lateral = np.sqrt(1 + squash[:, 0]), float(settings.lateral.max())
+    reach = np.hypot(lateral, stretch * (thickness + float(settings.margin)))
     listed = listed_pairs(contacts)
     assert len(np.unique(np.sort(listed, axis=0), axis=1).T) == len(listed.T)  # each once
     is_listed = np.zeros((count, count), dtype=bool)
@@ -138,19 +131,16 @@ def test_pairs_are_the_nearest_of_all(body, size):
         distances = np.where(side * above < -0.3 * thickness, np.inf, true)
         best = distances.min(axis=1)
         # Rounding of float32, of numbers up to 0.1, may decide who is just within reach, or nearer.
-        is_best = (distances < best[:, None] + 1e-6) & (distances < reach + 1e-6)
+        is_best = (distances < best[:, None] + 1e-6) & (distances < reach[:, None] + 1e-6)
         assert np.all((is_best & is_listed).any(axis=1)[best < reach - 1e-6])
         wanted |= is_best
         nearest.append(np.minimum(best, reach))
     assert np.all((wanted | wanted.T)[is_listed])
-    stretch = np.sqrt(1 + squash)
-    touching = np.hypot(float(settings.lateral), stretch * thickness)
-    squared = np.where(rest < float(settings.adjacent), np.inf, (away**2).sum(axis=0))
-    clear = np.minimum(np.sqrt(squared.min(axis=1)), SEARCH * reach)
+    touching = np.hypot(lateral, stretch * thickness)
+    squared = np.where(settings.may_touch, (away**2).sum(axis=0), np.inf)
+    clear = np.minimum(np.sqrt(squared.min(axis=1)), SEARCH * reach.max())
     free = np.maximum((np.min(nearest, axis=0) - touching) / stretch, clear - touching) / 2
-    np.testing.assert_allclose(
-        contacts.allowance, np.maximum(free, float(settings.slack)), atol=1e-6
-    )
+    np.testing.assert_allclose(contacts.allowance, np.maximum(free, settings.slack), atol=1e-6)
     position = jnp.asarray(position)
     expected = directions(settings, contacts, position, across(settings, position))
     is_pair = np.asarray(contacts.is_pair)
@@ -674,10 +664,10 @@ def test_a_busy_sample_looks_up_for_itself_alone():
         return touch(settings, contacts, nothing, ZERO, ZERO, position, 0 * position, passes=0)[2]
 
     found = jax.jit(jax.vmap(one))(moved)
-    np.testing.assert_array_equal(found.renewed, [False, True, False, True])
+    np.testing.assert_array_equal(found.renewed.any(axis=(1, 2)), [False, True, False, True])
     for index, position in enumerate(moved):
         alone = one(position)
-        for name in ("partner", "listed_by", "found_at", "allowance"):
+        for name in ("nearest", "distance", "partner", "listed_by", "found_at", "allowance"):
             np.testing.assert_allclose(getattr(found, name)[index], getattr(alone, name), atol=1e-7)
 
 

@@ -272,9 +272,9 @@ def test_distances_of_a_pair_of_layers_made_by_hand():
     position[:4] = position[:4:-1]  # the first rows above the last
     position[:4] += [0.0, 0.02, 0.006]
     position = position.reshape(-1, 3)
-    adjacent = 0.12
-    particles = self_contact.nearest_particles(body, position, adjacent).reshape(9, 9)
-    triangles = self_contact.nearest_triangles(body, position, adjacent).reshape(9, 9)
+    may_touch = np.linalg.norm(body.rest[:, None] - body.rest[None], axis=-1) > 0.12
+    particles = self_contact.nearest_particles(body, position, may_touch).reshape(9, 9)
+    triangles = self_contact.nearest_triangles(body, position, may_touch).reshape(9, 9)
     # Rows 0 to 2 are at rest eight, six and four cells from those that they lie on; row 3, at
     # two cells, may touch the next row only.
     np.testing.assert_allclose(particles[:3], np.hypot(0.02, 0.006), rtol=1e-12)

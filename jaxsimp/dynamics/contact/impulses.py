@@ -36,14 +36,15 @@ def resolve(
     """
     gather, collect = exchange
     ids, along = (contacts.partner, contacts.listed_by), contacts.direction
-    rows = jnp.concatenate([position, velocity, inverse_mass[None], carried[None]])
+    numbers = jnp.stack([inverse_mass, carried, settings.lateral])
+    rows = jnp.concatenate([position, velocity, numbers])
     theirs = gather(*ids, rows)
     away, speed = position[:, None] - theirs[:3], velocity[:, None] - theirs[3:6]
     distance, approach = dot(along, away), dot(along, speed)
     beside = dot(away, away) - distance * distance
     gap = distance - settings.thickness
     lacking = -jnp.maximum(gap, 0.0) / seconds - approach
-    near = contacts.is_pair & (beside < settings.lateral**2)
+    near = contacts.is_pair & (beside < jnp.maximum(settings.lateral[None], theirs[8]) ** 2)
     touches = near & ((gap < 0.0) | (lacking > 0.0))
     # A carried particle does not give way to what lies on it: the table would take the push.
     below, above = along[2] < -0.5, along[2] > 0.5

@@ -42,7 +42,7 @@ Touched = tuple[Padded, Padded, Contacts]
 
 def find_contacts(settings: SelfContact, position: Padded, missed: Float[Array, ""]) -> Contacts:
     """Look up the pairs that may touch, with so many contacts missed before."""
-    count, real = settings.apart.shape[1], position.dtype
+    count, real = settings.frame.shape[1], position.dtype
     nothing, zero = jnp.zeros(count, real), jnp.zeros((), real)
     still, missed = jnp.zeros_like(position), missed.astype(real)
     arguments = settings, no_contacts(count, zero), nothing, zero, zero, position, still
@@ -148,8 +148,8 @@ def touch_vjp(
     position_bar, velocity_bar, direction_bar = bars
     nothing = jnp.zeros_like(position_bar)
     looked_up = partial(_directions_bar, settings, after, touched, direction_bar)
-    position_bar += jax.lax.cond(after.renewed, looked_up, lambda: nothing)
-    direction_bar = jnp.where(after.renewed, 0.0, direction_bar)
+    position_bar += jax.lax.cond(after.renewed.any(), looked_up, lambda: nothing)
+    direction_bar = jnp.where(after.renewed[None], 0.0, direction_bar)
     arguments = settings, before, inverse_mass, floor, seconds, position, velocity
     leaves, tree = jax.tree.flatten((*arguments, position_bar, velocity_bar))
     if compiled.has_kernel("touch_vjp", str(position.dtype)):
@@ -167,6 +167,7 @@ def _directions_bar(
 ) -> Float[Array, "3 N"]:
     """Cotangent of the positions at which directions were found."""
     (position,) = _without_halo(after, touched)
+    direction_bar = jnp.where(after.renewed[None], direction_bar, 0.0)
 
     def found(position: Float[Array, "3 N"]) -> Float[Array, "3 2 N"]:
         return directions(settings, after, position, across(settings, position), REVERSIBLE)

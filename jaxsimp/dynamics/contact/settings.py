@@ -7,11 +7,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import face_areas
-from jaxsimp.bodies.topology import connected_pieces, half_edges, neighbours
+from jaxsimp.bodies.topology import half_edges, neighbours
 
 TOP_SPEED = 2.1
 """Default of the fastest that pickers may move, metres per second."""
@@ -19,8 +19,15 @@ LEVEL = 0.3
 """Layers closer than this, as a fraction of the thickness, count as side by side."""
 SEARCH = 1.5
 """Search radius, as a multiple of the distance up to which pairs are listed."""
+PATCH = 16
+"""Number of particles near each other at rest that lookups take together."""
 SPARE = 1.05
 """Times the thickness that layers are held apart: what presses them pushes them in a little."""
+NEIGHBOURHOOD = 1.25
+"""Particles nearer than this along the body, as a multiple of the longest spring there, do not
+touch."""
+DETOUR = 1.1
+"""Ratio of the distance along springs to that along the body, at most: 1.08 on a square grid."""
 AHEAD = 1
 """Look-ahead, in time steps: with more, lookups list more pairs, and their lists last longer."""
 MOST_LAYERS_OF_SHEETS = 1.1
@@ -33,8 +40,8 @@ MOST_LAYERS_OF_ROPES = 0.75
     jax.tree_util.register_dataclass,
     data_fields=[
         "frame",
-        "apart",
         "adjacent",
+        "order",
         "thickness",
         "lateral",
         "margin",
@@ -51,28 +58,52 @@ class SelfContact:
     Attributes:
         frame: ids `a, b, c, d` for each particle: its sheet's normal is along
             `(x_a - x_b) x (x_c - x_d)`, its rope's tangent along `x_a - x_b`, shape (4, N).
-        apart: rest coordinates, unconnected parts moved away from each other, shape (3, N), metres.
-        adjacent: pairs closer than that at rest do not collide, metres.
+        adjacent: ids of the particles too near along the body to touch each particle, itself
+            included and repeated after the last, shape (N, K).
+        order: ids of the particles so that those near each other at rest follow each other, for
+            lookups, shape (N,).
         thickness: distance that layers are held apart, `SPARE` times the body's, metres.
-        lateral: particles touch that are not farther apart along their layers, metres.
-        margin: how far is looked beyond what touches, metres.
-        slack: how far one that touches may move until contacts are looked up again, metres.
-        squash: weight that the squared distance across a sheet has on top of 1, where the nearest
-            particle is looked for: `|d|^2 + squash across^2`.
+        lateral: a particle touches others up to this far along its layer, shape (N,), metres.
+        margin: lookups list pairs up to this far beyond touching, metres.
+        slack: distance that a particle in contact may move until the next lookup, shape (N,),
+            metres.
+        squash: weight of the squared distance across a sheet, on top of 1, in the search for the
+            nearest particle, `|d|^2 + squash across^2`, shape (N,).
         friction: Coulomb coefficient between layers.
         is_sheet: whether the body is a sheet, or else a rope; static.
     """
 
     frame: Int[Array, "... 4 N"]
-    apart: Float[Array, "... 3 N"]
-    adjacent: Float[Array, "..."]
+    adjacent: Int[Array, "... N K"]
+    order: Int[Array, "... N"]
     thickness: Float[Array, "..."]
-    lateral: Float[Array, "..."]
+    lateral: Float[Array, "... N"]
     margin: Float[Array, "..."]
-    slack: Float[Array, "..."]
-    squash: Float[Array, "..."]
+    slack: Float[Array, "... N"]
+    squash: Float[Array, "... N"]
     friction: Float[Array, "..."]
     is_sheet: bool
+
+    @property
+    def may_touch(self) -> Bool[np.ndarray, "N N"]:
+        """Pairs of particles that are not adjacent."""
+        adjacent = np.asarray(self.adjacent)
+        found = np.ones((len(adjacent),) * 2, dtype=bool)
+        found[np.arange(len(adjacent))[:, None], adjacent] = False
+        return found
+
+
+def listing_distances(
+    settings: SelfContact,
+) -> tuple[Float[Array, " N"], Float[Array, " N"], Float[Array, ""]]:
+    """Distances up to which particles touch each one, and are listed, and the search radius.
+
+    The first two as the search for the nearest measures them, see `SelfContact.squash`; metres.
+    """
+    stretch, lateral = jnp.sqrt(1 + settings.squash), settings.lateral.max()
+    touching = jnp.hypot(lateral, stretch * settings.thickness)
+    reach = jnp.hypot(lateral, stretch * (settings.thickness + settings.margin))
+    return touching, reach, SEARCH * reach.max()
 
 
 def make_self_contact(
@@ -112,17 +143,19 @@ def make_self_contact(
             f"of {1e3 * time_step:.3g} ms. Take smaller limits, longer actions, a smaller time "
             f"step, or a larger thickness; or leave self-contact out"
         )
-    covering = _covering_radius(body) if is_sheet else np.sqrt(0.5) * _spacing(body)
+    covering = _covering_radii(body) if is_sheet else np.sqrt(0.5) * _spacings(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.
-    stretch = max(1.0, covering**2 / (3 * thickness**2)) if is_sheet else 1.0
+    stretch = (
+        np.maximum(1.0, covering**2 / (3 * thickness**2)) if is_sheet else np.ones(len(covering))
+    )
 
     def array(value: float | np.ndarray) -> Array:
         return jnp.asarray(value, dtype=float)
 
     return SelfContact(
         frame=jnp.asarray(_frames(body), dtype=int),
-        apart=array(_apart(body).T),
-        adjacent=array(max(1.25 * body.rest_length.max(), 2 * thickness)),
+        adjacent=jnp.asarray(_adjacent(body), dtype=int),
+        order=jnp.asarray(_order(body), dtype=int),
         thickness=array(SPARE * thickness),
         lateral=array(1.2 * covering),
         margin=array(AHEAD * top_speed * time_step),
@@ -133,28 +166,60 @@ def make_self_contact(
     )
 
 
-def _spacing(body: Body) -> float:
-    """Longest distance to the nearest neighbour in a rope, metres."""
+def _spacings(body: Body) -> Float[np.ndarray, " N"]:
+    """Longest distance to the nearest neighbour in a rope, for every particle, metres."""
     shortest = np.full(body.num_particles, np.inf)
     np.minimum.at(shortest, body.springs, body.rest_length[:, None])
-    return float(shortest.max())
+    return np.full(body.num_particles, shortest.max())
 
 
-def _covering_radius(body: Body) -> float:
-    """Discs this large about the corners cover every triangle, metres."""
+def _covering_radii(body: Body) -> Float[np.ndarray, " N"]:
+    """Discs this large about the corners of each triangle cover it, metres."""
     corners = body.rest[body.faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     area = face_areas(body.rest, body.faces)
     around = sides.prod(axis=1) / (4 * area)
     longest = sides.max(axis=1)
     obtuse = 2 * longest**2 > (sides**2).sum(axis=1)
-    return float(np.where(obtuse, longest / 2, around).max())
+    radius = np.where(obtuse, longest / 2, around)
+    largest = np.zeros(body.num_particles)
+    np.maximum.at(largest, body.faces, radius[:, None])
+    return np.where(largest > 0, largest, radius.max())
 
 
-def _apart(body: Body) -> np.ndarray:
-    """Rest coordinates, each part that no spring joins to the others far from them."""
-    _, part = connected_pieces(body.springs, body.num_particles)
-    return body.rest + 10 * body.size * part[:, None] * np.array([1.0, 0.0, 0.0])
+def _adjacent(body: Body) -> Int[np.ndarray, "N K"]:
+    """Ids for `SelfContact.adjacent`."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import dijkstra
+
+    count, (first, second) = body.num_particles, body.springs.T
+    longest = np.zeros(count)
+    np.maximum.at(longest, body.springs, body.rest_length[:, None])
+    own = np.maximum(NEIGHBOURHOOD * longest, 2 * body.material.thickness)
+    springs = csr_array((body.rest_length, (first, second)), shape=(count, count))
+
+    def near(sources: Int[np.ndarray, " _"]) -> Int[np.ndarray, "_ 2"]:
+        along = dijkstra(springs, directed=False, indices=sources, limit=DETOUR * own.max())
+        rows, others = np.nonzero(np.isfinite(along))
+        limit = np.maximum(own[sources[rows]], own[others])
+        straight = np.linalg.norm(body.rest[sources[rows]] - body.rest[others], axis=1)
+        chosen = (along[rows, others] < DETOUR * limit) & (straight < limit)
+        return np.stack([sources[rows], others], axis=1)[chosen]
+
+    # In parts: distances between all pairs would take memory by the square of their number.
+    parts = np.array_split(np.arange(count), 1 + count // 256)
+    pairs = np.concatenate([near(part) for part in parts])
+    starts, others = neighbours(pairs, count)
+    number = np.diff(starts)
+    place = np.minimum(np.arange(number.max()), number[:, None] - 1)
+    return others[starts[:-1, None] + place]
+
+
+def _order(body: Body) -> Int[np.ndarray, " N"]:
+    """Ids for `SelfContact.order`: halves of halves of the body at rest."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(body.rest, leafsize=PATCH).indices
 
 
 def _frames(body: Body) -> np.ndarray:
@@ -175,4 +240,4 @@ def _next(body: Body) -> Int[np.ndarray, "_ 2"]:
     """Pairs of next neighbours: along edges of triangles, or the shorter springs."""
     if len(body.faces):
         return half_edges(body.faces)[0]
-    return body.springs[body.rest_length < 1.5 * _spacing(body)]
+    return body.springs[body.rest_length < 1.5 * _spacings(body).max()]

@@ -10,7 +10,7 @@ import jaxlib.version
 from jax.tree_util import PyTreeDef
 from jaxtyping import Array, Float
 
-from jaxsimp.dynamics.contact.settings import LEVEL, SEARCH, SelfContact
+from jaxsimp.dynamics.contact.settings import LEVEL, SelfContact, listing_distances
 
 
 @cache
@@ -62,8 +62,10 @@ def touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
     constant = (
         inverse_mass,
         _numbers(settings, floor, seconds, real),
+        _sizes(settings, real),
         settings.frame.astype(jnp.int32),
-        settings.apart.astype(real),
+        settings.adjacent.astype(jnp.int32),
+        settings.order.astype(jnp.int32),
         jnp.asarray(settings.is_sheet),
         jnp.asarray(passes, jnp.int32),
     )
@@ -84,31 +86,24 @@ def touch_vjp(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
     )
     numbers = _numbers(settings, floor, seconds, real)
     fields = before.partner, before.direction, before.carried
-    passes_now = jnp.asarray(passes, jnp.int32)
-    found = call(position, velocity, *fields, inverse_mass, numbers, *bars, passes_now)
+    constant = inverse_mass, settings.lateral.astype(real), numbers
+    found = call(position, velocity, *fields, *constant, *bars, jnp.asarray(passes, jnp.int32))
     position_bar, velocity_bar, direction_bar, mass_bar, numbers_bar = found
     return [position_bar, velocity_bar, direction_bar, mass_bar, *numbers_bar]
 
 
 def _numbers(
     settings: SelfContact, floor: Float[Array, ""], seconds: Float[Array, ""], real: Any
-) -> Float[Array, " 12"]:
-    """Settings in the order in which the kernels read them."""
-    stretch = jnp.sqrt(1 + settings.squash)
-    near = stretch * settings.thickness
-    reach = jnp.hypot(settings.lateral, near + stretch * settings.margin)
-    numbers = [
-        settings.adjacent,
-        settings.thickness,
-        settings.lateral,
-        settings.slack,
-        settings.squash,
-        settings.friction,
-        floor,
-        seconds,
-        LEVEL * settings.thickness,
-        jnp.hypot(settings.lateral, near),
-        reach,
-        SEARCH * reach,
-    ]
+) -> Float[Array, " 6"]:
+    """Numbers in the order in which the kernels read them."""
+    _, _, search = listing_distances(settings)
+    level = LEVEL * settings.thickness
+    numbers = [settings.thickness, settings.friction, floor, seconds, level, search]
     return jnp.stack([jnp.asarray(each, real) for each in numbers])
+
+
+def _sizes(settings: SelfContact, real: Any) -> Float[Array, "5 N"]:
+    """Numbers of each particle, in the order in which the kernels read them."""
+    touching, reach, _ = listing_distances(settings)
+    sizes = settings.lateral, settings.slack, settings.squash, touching, reach**2
+    return jnp.stack(sizes).astype(real)

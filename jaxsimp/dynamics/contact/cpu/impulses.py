@@ -11,14 +11,16 @@ from jaxsimp.dynamics.contact.cpu.foreign import compiled
 
 @compiled
 @no_type_check
-def resolve(position, velocity, partner, direction, carried, inverse_mass, numbers, passes):
+def resolve(
+    position, velocity, partner, direction, carried, inverse_mass, lateral, numbers, passes
+):
     """Impulses and pushes; returns the number of contacts missed.
 
     Selections, not branches: what touches and what does not is anybody's guess.
     """
     real = carried.dtype.type
-    thickness, reach = numbers[1], numbers[2] * numbers[2]
-    friction, floor, rate, level = numbers[5], numbers[6], real(1) / numbers[7], numbers[8]
+    thickness, friction, floor = numbers[0], numbers[1], numbers[2]
+    rate, level = real(1) / numbers[3], numbers[4]
     (px, py, pz), (vx, vy, vz) = position, velocity
     count, missed = len(carried), 0
     along, partners = direction.reshape(3, 2 * count), partner.reshape(2 * count)
@@ -41,7 +43,8 @@ def resolve(position, velocity, partner, direction, carried, inverse_mass, numbe
             nx, ny, nz = along_x[pair], along_y[pair], along_z[pair]
             x, y, z = px[i] - px[j], py[i] - py[j], pz[i] - pz[j]
             distance = nx * x + ny * y + nz * z
-            near = x * x + y * y + z * z - distance * distance < reach
+            reach = max(lateral[i], lateral[j])
+            near = x * x + y * y + z * z - distance * distance < reach * reach
             missed += near & (distance < zero) & (turn == 0)
             gap = distance - thickness
             lies, below, above = near & (gap < level), nz < -half, nz > half
@@ -133,14 +136,16 @@ def _list_slots(partner, slots):
 
 @compiled
 @no_type_check
-def _list_touching(start, carried, partner, direction, numbers, touching, own, others, shares):
+def _list_touching(
+    start, carried, partner, direction, lateral, numbers, touching, own, others, shares
+):
     """Write the pairs that touch, what they move by, and in how many each particle is.
 
     Returns the number of pairs.
     """
     real = carried.dtype.type
     zero, one, half = real(0), real(1), real(0.5)
-    thickness, reach, seconds = numbers[1], numbers[2] * numbers[2], numbers[7]
+    thickness, seconds = numbers[0], numbers[3]
     px, py, pz, vx, vy, vz = start
     count = len(carried)
     num_touching = 0
@@ -155,7 +160,8 @@ def _list_touching(start, carried, partner, direction, numbers, touching, own, o
             gap = distance - thickness
             approach = nx * (vx[i] - vx[j]) + ny * (vy[i] - vy[j]) + nz * (vz[i] - vz[j])
             lacking = -max(gap, zero) / seconds - approach
-            near = x * x + y * y + z * z - distance * distance < reach
+            reach = max(lateral[i], lateral[j])
+            near = x * x + y * y + z * z - distance * distance < reach * reach
             if not (near and (gap < zero or lacking > zero)):
                 continue
             mine = one - carried[i] if nz < -half else one
@@ -186,7 +192,7 @@ def _stop_at_table(
 ):
     """End the cotangents of pushes, and of heights, where the table holds against a push."""
     real = shares.dtype.type
-    zero, thickness, floor = real(0), numbers[1], numbers[6]
+    zero, thickness, floor = real(0), numbers[0], numbers[2]
     px, py, pz = start[0], start[1], start[2]
     raised = np.zeros(len(shares), real)
     for place in range(len(touching)):
@@ -217,6 +223,7 @@ def resolve_vjp(
     partner,
     direction,
     inverse_mass,
+    lateral,
     numbers,
     position_bar,
     velocity_bar,
@@ -227,14 +234,14 @@ def resolve_vjp(
     """Adjoint of one pass of `resolve`: cotangents of its result become those of its start."""
     real = carried.dtype.type
     zero, one, half = real(0), real(1), real(0.5)
-    thickness, friction, seconds = numbers[1], numbers[5], numbers[7]
+    thickness, friction, seconds = numbers[0], numbers[1], numbers[3]
     px, py, pz, vx, vy, vz = start
     count = len(carried)
     touching = np.empty((2 * count, 3), np.uint32)
     own, others = np.empty(2 * count, real), np.empty(2 * count, real)
     shares = np.zeros(count, real)
     num_touching = _list_touching(
-        start, carried, partner, direction, numbers, touching, own, others, shares
+        start, carried, partner, direction, lateral, numbers, touching, own, others, shares
     )
     if num_touching == 0:
         return
