@@ -124,7 +124,7 @@ def settled(simulation: Simulation, position: Positions, seconds: float) -> Posi
     steps = round(seconds / float(simulation.time_step))
     pickers = make_pickers(steps=steps)
     nothing = Actions(jnp.full((1, 2), NONE), jnp.zeros((1, 2, 3)))
-    final, _ = run(simulation, pickers, at_rest(position), nothing, adjoint=False)
+    final, _ = run(simulation, pickers, at_rest(position), nothing)
     return np.asarray(final.position, dtype=float)
 
 
@@ -155,7 +155,7 @@ def folded(garment: Garment, simulation: Simulation) -> Positions:
     over, up = np.cos(angle) * y + np.sin(angle) * z, np.cos(angle) * z - np.sin(angle) * y
     moves = np.diff(np.stack([np.zeros_like(over), over, up], axis=-1), axis=0)
     actions = Actions(jnp.tile(jnp.asarray(picks), (16, 1)), jnp.asarray(moves, dtype=float))
-    state, _ = run(simulation, pickers, at_rest(start), actions, adjoint=False)
+    state, _ = run(simulation, pickers, at_rest(start), actions)
     return settled(simulation, np.asarray(state.position), 1.0)
 
 
@@ -213,7 +213,7 @@ def plot_two_sheets(quick: bool) -> "tuple[Figure, str]":
     """A T-shirt in the air, dropped and folded, and the fold cut."""
     import matplotlib.pyplot as plt
 
-    garment = shirt(900, 0.5) if quick else shirt(3600)
+    garment = shirt(900, 0.5) if quick else shirt(6000)
     simulation = simulation_of(garment)
     air = in_the_air(garment, 0)
     dropped, fold = settled(simulation, air, 2.0), folded(garment, simulation)
