@@ -217,8 +217,8 @@ def plot_two_sheets(quick: bool) -> "tuple[Figure, str]":
     simulation = simulation_of(garment)
     air = in_the_air(garment, 0)
     dropped, fold = settled(simulation, air, 2.0), folded(garment, simulation)
-    figure = plt.figure(figsize=(9.6, 5.0), layout="constrained")
-    grid = figure.add_gridspec(2, 3, height_ratios=[2.6, 1])
+    figure = plt.figure(figsize=(9.6, 3.9), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=[2.2, 1])
     shown = {"In the air": air, "Dropped": dropped, "Folded once across": fold}
     for column, (name, position) in enumerate(shown.items()):
         axes = figure.add_subplot(grid[0, column], projection="3d")
@@ -239,7 +239,7 @@ def _draw(axes: "Axes3D", garment: Garment, position: Positions, name: str) -> N
     low, high = position.min(axis=0), position.max(axis=0)
     high[2] = max(high[2], low[2] + 0.02)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.1)
+    axes.set_box_aspect(high - low, zoom=1.2)
     axes.view_init(elev=40, azim=-60)
     axes.set_axis_off()
     axes.set_title(name, fontsize="medium")
@@ -255,6 +255,5 @@ def _draw_cut(axes: "Axes", garment: Garment, position: Positions) -> None:
         for number, ends in enumerate(1e3 * cut(sheet, position, place, normal)):
             label = name if number == 0 else None
             axes.plot(*ends[:, 1:].T, color=color, lw=1.2, solid_capstyle="round", label=label)
-    axes.set(xlabel="y (mm), in the middle plane", ylabel="z (mm)", aspect="equal")
-    axes.set_ylim(0, None)
-    axes.legend(frameon=False, fontsize="small", loc="upper right")
+    axes.set(xlabel="y (mm), in the middle plane", ylabel="z (mm), × 3", aspect=3, ylim=(0, None))
+    axes.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
