@@ -22,8 +22,6 @@ Pairs = Float[Array, "2 N"]
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=[
-        "nearest",
-        "distance",
         "partner",
         "listed_by",
         "direction",
@@ -40,24 +38,18 @@ class Contacts:
     """Pairs of particles that may touch. Slot `k N + i` is the pair that particle `i` lists.
 
     Attributes:
-        nearest: id of the nearest particle above (`k = 0`) and below (`k = 1`) each, shape (2, N);
-            its own id where there is none.
-        distance: squared distances to them as the search measures them, see `SelfContact.squash`,
-            when they were found, shape (2, N), square metres.
-        partner: id of the particle listed by each particle, above and below, shape (2, N); its
-            own id where it lists none.
+        partner: id of the particle listed by each particle, above (`k = 0`) and below (`k = 1`),
+            shape (2, N); its own id where it lists none.
         listed_by: slots that list each particle, shape (CAPACITY, N); 2 N after the last.
         direction: unit vector from the partner to the particle, shape (3, 2, N).
-        found_at: where each particle was looked up, moved along with all, shape (3, N), metres.
-        allowance: distance from there that each particle may move until it is looked up again,
-            shape (N,), metres.
+        found_at: positions at the last lookup, shape (3, N), metres.
+        allowance: distance from there that each particle may move until the next lookup, shape
+            (N,), metres.
         carried: 1 for a particle that lies on the table or on a carried particle, shape (N,).
         missed: number of contacts so far whose particles passed each other within a time step.
-        renewed: slots whose direction was found in the last step, shape (2, N).
+        renewed: whether the pairs were looked up in the last step.
     """
 
-    nearest: Int[Array, "... 2 N"]
-    distance: Float[Array, "... 2 N"]
     partner: Int[Array, "... 2 N"]
     listed_by: Int[Array, "... C N"]
     direction: Float[Array, "... 3 2 N"]
@@ -65,7 +57,7 @@ class Contacts:
     allowance: Float[Array, "... N"]
     carried: Float[Array, "... N"]
     missed: Float[Array, "..."]
-    renewed: Bool[Array, "... 2 N"]
+    renewed: Bool[Array, "..."]
 
     @property
     def is_pair(self) -> Bool[Array, "2 N"]:
@@ -80,18 +72,15 @@ DIRECTION = list(Contacts.__dataclass_fields__).index("direction")
 def no_contacts(count: int, missed: Float[Array, ""]) -> Contacts:
     """Contacts of `count` particles that list no pair, and are due for a lookup."""
     real = missed.dtype
-    own = jnp.tile(jnp.arange(count, dtype=jnp.int32), (2, 1))
     return Contacts(
-        nearest=own,
-        distance=jnp.full((2, count), jnp.inf, real),
-        partner=own,
+        partner=jnp.tile(jnp.arange(count, dtype=jnp.int32), (2, 1)),
         listed_by=jnp.full((CAPACITY, count), 2 * count, jnp.int32),
         direction=jnp.zeros((3, 2, count), real),
         found_at=jnp.zeros((3, count), real),
         allowance=jnp.full(count, -1.0, real),
         carried=jnp.zeros(count, real),
         missed=missed,
-        renewed=jnp.zeros((2, count), bool),
+        renewed=jnp.zeros((), bool),
     )
 
 

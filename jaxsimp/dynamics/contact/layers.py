@@ -148,8 +148,8 @@ def touch_vjp(
     position_bar, velocity_bar, direction_bar = bars
     nothing = jnp.zeros_like(position_bar)
     looked_up = partial(_directions_bar, settings, after, touched, direction_bar)
-    position_bar += jax.lax.cond(after.renewed.any(), looked_up, lambda: nothing)
-    direction_bar = jnp.where(after.renewed[None], 0.0, direction_bar)
+    position_bar += jax.lax.cond(after.renewed, looked_up, lambda: nothing)
+    direction_bar = jnp.where(after.renewed, 0.0, direction_bar)
     arguments = settings, before, inverse_mass, floor, seconds, position, velocity
     leaves, tree = jax.tree.flatten((*arguments, position_bar, velocity_bar))
     if compiled.has_kernel("touch_vjp", str(position.dtype)):
@@ -167,7 +167,6 @@ def _directions_bar(
 ) -> Float[Array, "3 N"]:
     """Cotangent of the positions at which directions were found."""
     (position,) = _without_halo(after, touched)
-    direction_bar = jnp.where(after.renewed[None], direction_bar, 0.0)
 
     def found(position: Float[Array, "3 N"]) -> Float[Array, "3 2 N"]:
         return directions(settings, after, position, across(settings, position), REVERSIBLE)

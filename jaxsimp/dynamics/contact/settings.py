@@ -19,15 +19,15 @@ LEVEL = 0.3
 """Layers closer than this, as a fraction of the thickness, count as side by side."""
 SEARCH = 1.5
 """Search radius, as a multiple of the distance up to which pairs are listed."""
-PATCH = 16
-"""Number of particles near each other at rest that lookups take together."""
 SPARE = 1.05
 """Times the thickness that layers are held apart: what presses them pushes them in a little."""
 NEIGHBOURHOOD = 1.25
-"""Particles nearer than this along the body, as a multiple of the longest spring there, do not
+"""Particles nearer than this along the body, as a multiple of the longest spring of each, do not
 touch."""
 DETOUR = 1.1
 """Ratio of the distance along springs to that along the body, at most: 1.08 on a square grid."""
+SLACK = 0.4
+"""Distance that a particle in contact may move until the next lookup, in radii of its disc."""
 AHEAD = 1
 """Look-ahead, in time steps: with more, lookups list more pairs, and their lists last longer."""
 MOST_LAYERS_OF_SHEETS = 1.1
@@ -41,7 +41,6 @@ MOST_LAYERS_OF_ROPES = 0.75
     data_fields=[
         "frame",
         "adjacent",
-        "order",
         "thickness",
         "lateral",
         "margin",
@@ -60,8 +59,6 @@ class SelfContact:
             `(x_a - x_b) x (x_c - x_d)`, its rope's tangent along `x_a - x_b`, shape (4, N).
         adjacent: ids of the particles too near along the body to touch each particle, itself
             included and repeated after the last, shape (N, K).
-        order: ids of the particles so that those near each other at rest follow each other, for
-            lookups, shape (N,).
         thickness: distance that layers are held apart, `SPARE` times the body's, metres.
         lateral: a particle touches others up to this far along its layer, shape (N,), metres.
         margin: lookups list pairs up to this far beyond touching, metres.
@@ -75,7 +72,6 @@ class SelfContact:
 
     frame: Int[Array, "... 4 N"]
     adjacent: Int[Array, "... N K"]
-    order: Int[Array, "... N"]
     thickness: Float[Array, "..."]
     lateral: Float[Array, "... N"]
     margin: Float[Array, "..."]
@@ -155,11 +151,10 @@ def make_self_contact(
     return SelfContact(
         frame=jnp.asarray(_frames(body), dtype=int),
         adjacent=jnp.asarray(_adjacent(body), dtype=int),
-        order=jnp.asarray(_order(body), dtype=int),
         thickness=array(SPARE * thickness),
         lateral=array(1.2 * covering),
         margin=array(AHEAD * top_speed * time_step),
-        slack=array(0.25 * covering),
+        slack=array(SLACK * covering),
         squash=array(stretch - 1),
         friction=array(friction),
         is_sheet=is_sheet,
@@ -201,7 +196,7 @@ def _adjacent(body: Body) -> Int[np.ndarray, "N K"]:
     def near(sources: Int[np.ndarray, " _"]) -> Int[np.ndarray, "_ 2"]:
         along = dijkstra(springs, directed=False, indices=sources, limit=DETOUR * own.max())
         rows, others = np.nonzero(np.isfinite(along))
-        limit = np.maximum(own[sources[rows]], own[others])
+        limit = np.minimum(own[sources[rows]], own[others])
         straight = np.linalg.norm(body.rest[sources[rows]] - body.rest[others], axis=1)
         chosen = (along[rows, others] < DETOUR * limit) & (straight < limit)
         return np.stack([sources[rows], others], axis=1)[chosen]
@@ -213,13 +208,6 @@ def _adjacent(body: Body) -> Int[np.ndarray, "N K"]:
     number = np.diff(starts)
     place = np.minimum(np.arange(number.max()), number[:, None] - 1)
     return others[starts[:-1, None] + place]
-
-
-def _order(body: Body) -> Int[np.ndarray, " N"]:
-    """Ids for `SelfContact.order`: halves of halves of the body at rest."""
-    from scipy.spatial import cKDTree
-
-    return cKDTree(body.rest, leafsize=PATCH).indices
 
 
 def _frames(body: Body) -> np.ndarray:

@@ -65,7 +65,6 @@ def touch(tree: PyTreeDef, passes: int, leaves: list[Array]) -> list[Array]:
         _sizes(settings, real),
         settings.frame.astype(jnp.int32),
         settings.adjacent.astype(jnp.int32),
-        settings.order.astype(jnp.int32),
         jnp.asarray(settings.is_sheet),
         jnp.asarray(passes, jnp.int32),
     )
@@ -105,5 +104,5 @@ def _numbers(
 def _sizes(settings: SelfContact, real: Any) -> Float[Array, "5 N"]:
     """Numbers of each particle, in the order in which the kernels read them."""
     touching, reach, _ = listing_distances(settings)
-    sizes = settings.lateral, settings.slack, settings.squash, touching, reach**2
+    sizes = settings.lateral, settings.slack, settings.squash, touching, reach
     return jnp.stack(sizes).astype(real)

@@ -22,11 +22,11 @@ from jaxsimp.dynamics.contact.cpu.foreign import (
     vector,
 )
 from jaxsimp.dynamics.contact.cpu.impulses import resolve, resolve_vjp
-from jaxsimp.dynamics.contact.cpu.lookup import look_up
+from jaxsimp.dynamics.contact.cpu.lookup import find_pairs, gone_too_far
 
-NUM_CHANGING = 12
+NUM_CHANGING = 10
 """Positions, velocities, and the fields of `Contacts`."""
-NUM_OPERANDS = NUM_CHANGING + 8
+NUM_OPERANDS = NUM_CHANGING + 7
 NUM_VJP_OPERANDS, NUM_VJP_RESULTS = 11, 5
 
 
@@ -57,28 +57,30 @@ def _touch_float64(frame):
 @no_type_check
 def _touch(sources, targets, real):
     position, velocity = matrix(targets[0], real), matrix(targets[1], real)
-    nearest, distance = matrix(targets[2], np.int32), matrix(targets[3], real)
-    partner, listed_by = matrix(targets[4], np.int32), matrix(targets[5], np.int32)
-    direction, found_at = tensor(targets[6], real), matrix(targets[7], real)
-    allowance, carried = vector(targets[8], real), vector(targets[9], real)
-    missed, renewed = scalar(targets[10], real), matrix(targets[11], np.bool_)
+    partner, listed_by = matrix(targets[2], np.int32), matrix(targets[3], np.int32)
+    direction = tensor(targets[4], real)
+    found_at, allowance = matrix(targets[5], real), vector(targets[6], real)
+    carried, missed = vector(targets[7], real), scalar(targets[8], real)
+    renewed = scalar(targets[9], np.bool_)
     words = position.itemsize // 4
-    for place in range(11):
-        pass_on(sources[place], targets[place], 1 if place == 2 or 4 <= place <= 5 else words)
-    inverse_mass, numbers = vector(sources[12], real), vector(sources[13], real)
-    sizes, frame = matrix(sources[14], real), matrix(sources[15], np.int32)
-    adjacent, order = matrix(sources[16], np.int32), vector(sources[17], np.int32)
-    is_sheet, passes = scalar(sources[18], np.bool_)[0], scalar(sources[19], np.int32)[0]
+    for place in range(9):
+        pass_on(sources[place], targets[place], 1 if place == 2 or place == 3 else words)
+    inverse_mass, numbers = vector(sources[10], real), vector(sources[11], real)
+    sizes, frame = matrix(sources[12], real), matrix(sources[13], np.int32)
+    adjacent = matrix(sources[14], np.uint32)
+    is_sheet, passes = scalar(sources[15], np.bool_)[0], scalar(sources[16], np.int32)[0]
     halo = (position.shape[1] - len(carried)) // 2
     here, speed = _rows(position, halo), _rows(velocity, halo)
     if passes > 0:
         missed[0] += resolve(
             *(here, speed, partner, direction, carried, inverse_mass, sizes[0], numbers, passes)
         )
-    look_up(
-        *(here, nearest, distance, partner, listed_by, direction, found_at, allowance, renewed),
-        *(numbers, sizes, frame, adjacent, order, is_sheet),
-    )
+    renewed[0] = gone_too_far(here, found_at, allowance)
+    if renewed[0]:
+        find_pairs(
+            *(here, partner, listed_by, direction, found_at, allowance),
+            *(numbers, sizes, frame, adjacent, is_sheet),
+        )
 
 
 @njit(inline="always")
