@@ -171,15 +171,15 @@ def test_gradients_through_contact_of_two_sheets_equal_differences():
         jit(partial(cost, each)) for each in (simulation, replace(simulation, self_contact=None))
     )
     gradient = jit(jax.grad(partial(cost, simulation), (1, 2)))
-    step = 1e-9
-    for seed in range(3):
+    step, is_smooth = 1e-9, []
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         position = jnp.asarray(in_the_air(garment, seed))
         displacement = jnp.asarray(rng.uniform(-0.02, 0.02, (2, 2, 3)))
         weights = jnp.asarray(rng.standard_normal((2, body.num_particles, 3)))
         arguments = weights, position, displacement
-        found = gradient(*arguments)
-        assert abs(free(*arguments) - value(*arguments)) > 1e-3  # they touch
+        here, found = value(*arguments), gradient(*arguments)
+        assert abs(free(*arguments) - here) > 1e-4  # they touch
         for place in range(2):
             along = [np.zeros(position.shape), np.zeros(displacement.shape)]
             along[place] = rng.standard_normal(along[place].shape)
@@ -187,7 +187,11 @@ def test_gradients_through_contact_of_two_sheets_equal_differences():
                 value(weights, position + move * along[0], displacement + move * along[1])
                 for move in (step, -step)
             )
-            # Rounding of the difference, 1e-15 / 1e-9, against slopes of 1 to 100.
-            np.testing.assert_allclose(
-                (ahead - behind) / (2 * step), np.vdot(found[place], along[place]), rtol=1e-5
-            )
+            # Not across a jump, where another contact is found: differences from either side tell.
+            is_smooth.append(np.isclose(ahead - here, here - behind, rtol=1e-3))
+            if is_smooth[-1]:
+                # Rounding of the difference, 1e-15 / 1e-9, against slopes of 1 to 100.
+                wanted = (ahead - behind) / (2 * step)
+                np.testing.assert_allclose(np.vdot(found[place], along[place]), wanted, rtol=1e-5)
+    # One of 24 was seen to be within 1e-8 of a jump.
+    assert sum(is_smooth) >= 10
