@@ -29,6 +29,7 @@ SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
     "cold_start": planning.cold_start,
     "scaling": rollouts.scaling,
     "self_contact": contact.self_contact,
+    "crumpling": contact.crumpling,
     "contact_gradient": contact.contact_gradient,
 }
 

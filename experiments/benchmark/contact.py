@@ -32,23 +32,49 @@ from jaxsimp.dynamics import (
 from jaxsimp.engines import Layout, PopulationMap
 
 ACTION_SECONDS = 0.25
+CRUMPLED = 4
+"""Plans that crumple a cloth: how much it touches itself differs from plan to plan."""
+MakePlans = Callable[[int, Scale], Actions]
+"""Plans for a cloth of so many particles along a side."""
 
 
 def self_contact(scale: Scale) -> Iterator[Row]:
     """A cloth that is folded and settles, with and without self-contact, in turns."""
+    yield from _with_and_without("self_contact", _folding, scale)
+
+
+def crumpling(scale: Scale) -> Iterator[Row]:
+    """The same for a cloth that is crumpled: random grasps, carried up to 0.2 m along each axis."""
+    yield from _with_and_without("crumpling", _crumpling, scale)
+
+
+def _with_and_without(name: str, make_plans: MakePlans, scale: Scale) -> Iterator[Row]:
     sides = scale.contact_sides
+    plans = {side: make_plans(side, scale) for side in sides}
+    steps = {side: plans[side].pick.shape[1] * _action_steps(side) for side in sides}
+    population = len(plans[sides[0]].pick)
     ready = {
-        (side, touches): prepare(partial(_fold, side, touches))
+        (side, touches): prepare(partial(_rollouts, side, touches, plans[side]))
         for side in sides
         for touches in (False, True)
     }
     times = time_in_turns([each.run for each in ready.values()], scale.repeats)
     seconds = dict(zip(ready, times.T, strict=True))
-    each_step = [float(np.median(seconds[side, True])) / _num_steps(side) for side in sides]
+    each_step = [float(np.median(seconds[side, True])) / steps[side] for side in sides]
     particles = [side**2 for side in sides]
     exponent = fit_exponent(particles, each_step) if len(sides) > 1 else None
     for (side, touches), prepared in ready.items():
-        yield _row(side, touches, prepared, seconds) | {"exponent": exponent if touches else None}
+        taken = seconds[side, touches]
+        yield make_row(
+            name,
+            engine="jaxsimp",
+            body=f"cloth_{side}",
+            population=population,
+            layout="self-contact" if touches else "passes through itself",
+            steps=steps[side],
+            ratio_to_without=(float(np.median(taken / seconds[side, False])) if touches else None),
+            exponent=exponent if touches else None,
+        ) | measured(prepared, taken, population * side**2 * steps[side])
 
 
 def contact_gradient(scale: Scale) -> Iterator[Row]:
@@ -58,12 +84,13 @@ def contact_gradient(scale: Scale) -> Iterator[Row]:
         "forward": _spread,
         "gradient": jax.value_and_grad(_spread),
     }
-    shared, plans = _carried_over(side, touches=True, num_actions=2)
+    shared = _shared(side, touches=True)
+    plans = jax.tree.map(lambda each: each[:, :2], _folding(side, scale))
     maps = [_mapped(function, shared, plans) for function in functions.values()]
     ready = [prepare(partial(partial, mapped, shared, plans)) for mapped in maps]
     times = time_in_turns([each.run for each in ready], scale.repeats)
     ratios = (None, float(np.median(times[:, 1] / times[:, 0])))
-    steps = _num_steps(side) // 2
+    steps = 2 * _action_steps(side)
     for name, mapped, each, seconds, ratio in zip(
         functions, maps, ready, times.T, ratios, strict=True
     ):
@@ -93,49 +120,40 @@ def _spread(displacement: jax.Array, shared: Any, pick: jax.Array) -> jax.Array:
     return jnp.sum((_final(shared, Actions(pick, displacement)) - shared[2]) ** 2)
 
 
-def _row(
-    side: int, touches: bool, prepared: Prepared, seconds: dict[tuple[int, bool], np.ndarray]
-) -> Row:
-    taken = seconds[side, touches]
-    ratio = float(np.median(taken / seconds[side, False])) if touches else None
-    return make_row(
-        "self_contact",
-        engine="jaxsimp",
-        body=f"cloth_{side}",
-        population=1,
-        layout="self-contact" if touches else "passes through itself",
-        steps=_num_steps(side),
-        ratio_to_without=ratio,
-    ) | measured(prepared, taken, side**2 * _num_steps(side))
-
-
 def _time_step(side: int) -> float:
     return min(2e-3, 0.9 * largest_time_step(cloth((side, side))))
 
 
-def _num_steps(side: int) -> int:
-    """Number of time steps of two actions that fold, and two with nothing held."""
-    return 4 * round(ACTION_SECONDS / _time_step(side))
+def _action_steps(side: int) -> int:
+    return round(ACTION_SECONDS / _time_step(side))
 
 
-def _fold(side: int, touches: bool) -> partial[object]:
-    """A rollout that carries two corners over to the other two, and lets go."""
-    shared, plans = _carried_over(side, touches, num_actions=4)
+def _rollouts(side: int, touches: bool, plans: Actions) -> partial[object]:
+    shared = _shared(side, touches)
     return partial(PopulationMap(_final, shared, plans, Layout()), shared, plans)
 
 
-def _carried_over(side: int, touches: bool, num_actions: int) -> tuple[Any, Actions]:
-    """What rollouts of a cloth share, and a plan that folds it in two actions, and then idles."""
+def _shared(side: int, touches: bool) -> Any:
+    """What rollouts of a cloth share: physics, pickers and the start."""
     body = cloth((side, side))
     simulation = make_simulation(body, _time_step(side), self_contact=touches)
-    pickers = make_pickers((0.2, 0.2, 0.2), steps=_num_steps(side) // 4)
-    moves = np.zeros((num_actions, 2, 3))
+    pickers = make_pickers((0.2, 0.2, 0.2), steps=_action_steps(side))
+    return simulation, pickers, jnp.asarray(goals.flat(body), dtype=float)
+
+
+def _folding(side: int, scale: Scale) -> Actions:
+    """Two corners are carried over to the other two; then nothing is held for two actions."""
+    moves, picks = np.zeros((4, 2, 3)), np.full((4, 2), NONE)
     moves[:2, :, 0], moves[0, :, 2], moves[1, :, 2] = 0.145, 0.1, -0.094
-    picks = np.full((num_actions, 2), NONE)
     picks[:2] = [0, side - 1]
-    actions = Actions(jnp.asarray(picks), jnp.asarray(moves, dtype=float))
-    shared = simulation, pickers, jnp.asarray(goals.flat(body), dtype=float)
-    return shared, jax.tree.map(lambda each: each[None], actions)
+    return Actions(jnp.asarray(picks[None]), jnp.asarray(moves[None], dtype=float))
+
+
+def _crumpling(side: int, scale: Scale) -> Actions:
+    rng, shape = np.random.default_rng(0), (CRUMPLED, scale.crumpling_actions, 2)
+    moves = rng.uniform(-0.2, 0.2, (*shape, 3))
+    picks = rng.integers(0, side**2, shape)
+    return Actions(jnp.asarray(picks), jnp.asarray(moves, dtype=float))
 
 
 def _final(shared: Any, actions: Actions) -> jax.Array:

@@ -49,6 +49,7 @@ class Scale:
         populations: populations of the second sweep.
         horizons: numbers of actions in the rollouts of the third sweep.
         contact_sides: sides of the cloths with self-contact, in particles.
+        crumpling_actions: number of actions that crumple them.
         cem_side: number of particles along a side of the cloth in planning.
         cem_iterations: number of CEM iterations of a plan.
         cem_plans: number of plans.
@@ -70,6 +71,7 @@ class Scale:
     populations: tuple[int, ...]
     horizons: tuple[int, ...]
     contact_sides: tuple[int, ...]
+    crumpling_actions: int
     cem_side: int
     cem_iterations: int
     cem_plans: int
@@ -92,6 +94,7 @@ FULL = Scale(
     populations=(16, 64, 256, 1024),
     horizons=(2, 4, 8, 16, 32),
     contact_sides=(25, 36, 50, 64),
+    crumpling_actions=15,
     cem_side=25,
     cem_iterations=15,
     cem_plans=3,
@@ -113,6 +116,7 @@ QUICK = Scale(
     populations=(16, 64),
     horizons=(2, 16),
     contact_sides=(25,),
+    crumpling_actions=3,
     cem_side=15,
     cem_iterations=4,
     cem_plans=1,

@@ -413,7 +413,7 @@ def test_a_long_edge_lets_nothing_through_elsewhere():
     position[7:, :, 2] += 6e-3
     position = np.append(position.reshape(-1, 3), body.rest[-1:], axis=0)
     simulation = make_simulation(body, 2e-3, self_contact=True)
-    final = settle(simulation, at_rest(position + [0, 0, body.radius]), 300)
+    final = settle(simulation, at_rest(position + np.array([0, 0, body.radius])), 300)
     layers = np.asarray(final.position)[:-1, 2].reshape(side, side)
     # Away from the crease and from the tip: a thickness above what was mirrored on them.
     gaps = (layers[9:] - layers[3::-1])[:, 1:-1] / (2 * body.radius)
