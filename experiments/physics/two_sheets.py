@@ -239,7 +239,7 @@ def _draw(axes: "Axes3D", garment: Garment, position: Positions, name: str) -> N
     low, high = position.min(axis=0), position.max(axis=0)
     high[2] = max(high[2], low[2] + 0.02)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(high - low, zoom=1.2)
+    axes.set_box_aspect(high - low, zoom=1.05)
     axes.view_init(elev=40, azim=-60)
     axes.set_axis_off()
     axes.set_title(name, fontsize="medium")
