@@ -27,7 +27,12 @@ lengths = st.floats(0.25, 0.7)
 
 def two_sheets(make):
     """A garment of two sheets, with twice the particles, so that a sheet has as many."""
-    return lambda num_particles: make(num_particles=2 * num_particles, sheets=2)
+
+    def made(num_particles: int) -> Garment:
+        return make(num_particles=2 * num_particles, sheets=2)
+
+    made.__name__ = f"{make.__name__}_of_two_sheets"
+    return made
 
 
 @pytest.mark.parametrize("make", GARMENTS + [two_sheets(make) for make in SEWN])
