@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from experiments.physics import against_mujoco, resolution, self_contact, swings
+from experiments.physics import against_mujoco, resolution, self_contact, swings, two_sheets
 from jaxsimp.cli.status import exit_status
 
 if TYPE_CHECKING:
@@ -21,13 +21,14 @@ FIGURES: "dict[str, Callable[[bool], tuple[Figure, str]]]" = {
     "energy": swings.plot_energy,
     "mujoco": against_mujoco.plot_mujoco,
     "self_contact": self_contact.plot_self_contact,
+    "two_sheets": two_sheets.plot_two_sheets,
 }
 """Functions that draw a figure, by its name; each also returns a line with its numbers."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Figures of the physics page: convergence, energy, MuJoCo beside ours, and self-contact."""
+    """Figures of the physics page: convergence, energy, MuJoCo beside ours, contact, garments."""
 
     out: Path = Path("docs/figures")
     """Folder of the figures, created if missing."""

@@ -87,6 +87,15 @@ def check_self_contact(figure):
     assert without > 2 * touching
 
 
+def check_two_sheets(figure):
+    *shown, cut = figure.axes
+    assert [axes.get_title() for axes in shown] == ["In the air", "Dropped", "Folded once across"]
+    assert labels(cut) == ["front", "back"]
+    # Four layers, less than twice as high at the crease, millimetres.
+    highest = max(line.get_ydata().max() for line in cut.lines)
+    assert 4 * 4 < highest < 2 * 4 * 4.2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", command.FIGURES)
 def test_a_figure_shows_its_physics_and_its_numbers_are_said(name, tmp_path, capsys, figures_saved):
