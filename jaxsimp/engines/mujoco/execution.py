@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsimp.dynamics import NONE, Actions, Pickers, make_pickers
+from jaxsimp.dynamics import NONE, Actions, Pickers, Simulation, make_pickers
 from jaxsimp.dynamics.pickers import grasp, speed_profile
 from jaxsimp.engines.engine import Execution, ExecutionStatus, Executor
 from jaxsimp.engines.mujoco.model import Variant, as_variant, make_model
@@ -90,7 +90,7 @@ def replay(
             f"{len(episodes)} episodes are given for {len(plans)} plans; give one for each"
         )
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
-    model = make_model(task.body, variant, picked)
+    model = make_model(task.body, variant, picked, obstacles=task.obstacles)
     one = partial(_replay_one, task, model, jax.jit(partial(score, task)))
     return _side_by_side(one, episodes, plans, num_workers or num_cores())
 
@@ -138,6 +138,7 @@ class _Scene:
         self._data.qpos[:] = (start - task.body.rest).ravel()
         self._steps = max(1, round(task.action_seconds / model.opt.timestep))
         self._pickers = make_pickers(task.limits, steps=self._steps)
+        self._simulation = task.simulation()  # for the pickers' rules alone
         speed = np.asarray(speed_profile(self._steps), dtype=float)
         self._ahead = np.cumsum(speed) + (LEAD - 1) * speed
         self.unstable = False
@@ -152,7 +153,7 @@ class _Scene:
     def act(self, pick: np.ndarray, displacement: np.ndarray) -> None:
         """Carry out one action."""
         start = self.positions()
-        held, moves = _grasp(self._task, self._pickers, start, pick, displacement)
+        held, moves = _grasp(self._simulation, self._pickers, start, pick, displacement)
         hold = [(self._picker(i), start[i], moves[i]) for i in np.flatnonzero(held).tolist()]
         for (constraint, _), _, _ in hold:
             self._data.eq_active[constraint] = 1
@@ -205,21 +206,17 @@ def _unstable_kinds() -> tuple[int, ...]:
 
 
 def _grasp(
-    task: Task, pickers: Pickers, position: np.ndarray, pick: np.ndarray, displacement: np.ndarray
+    simulation: Simulation,
+    pickers: Pickers,
+    position: np.ndarray,
+    pick: np.ndarray,
+    displacement: np.ndarray,
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
     """Held particles of an action, and the displacement of each."""
     action = Actions(jnp.asarray(pick), jnp.asarray(displacement, dtype=float))
-    rest, floor = jnp.asarray(task.body.rest, float), jnp.asarray(task.body.radius, float)
-    held, moves = _jitted_grasp(pickers, rest, floor, jnp.asarray(position, float), action)
+    around = simulation.rest, simulation.obstacles, simulation.radius
+    held, moves = _jitted_grasp(pickers, *around, jnp.asarray(position, float), action)
     return np.asarray(held), np.asarray(moves, dtype=float)
 
 
-@jax.jit
-def _jitted_grasp(
-    pickers: Pickers,
-    rest: Float[Array, "N 3"],
-    floor: Float[Array, ""],
-    position: Float[Array, "N 3"],
-    action: Actions,
-) -> tuple[Bool[Array, " N"], Float[Array, "N 3"]]:
-    return grasp(pickers, rest, floor, position, action)
+_jitted_grasp = jax.jit(grasp)
