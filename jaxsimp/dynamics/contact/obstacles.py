@@ -22,7 +22,7 @@ from jaxsimp.bodies.meshes import face_areas
 Axes = Sequence[Any]
 """Values of points along x, y and z, shape (*N,) each; a normal may have numbers among them."""
 Number = Float[Array | np.ndarray, "..."] | float | int
-Vector = Float[Array | np.ndarray, "... 3"] | tuple[float, float, float]
+Vector = Float[Array | np.ndarray, "... 3"] | tuple[float | int, float | int, float | int]
 
 UP = (0.0, 0.0, 1.0)
 """The constant normal of the table: contact along it is arithmetic of heights alone."""
