@@ -158,11 +158,11 @@ def _clear_share(
     def ahead(share: Float[Array, " G"]) -> Float[Array, " G"]:
         place = start + share[:, None] * way
         distance, normal = obstacle.distance(*place.T)
-        clearance = jnp.maximum(distance - radius + GRAZE, 0.0)
+        clearance = distance - radius + GRAZE
         speed = sum(part * along for part, along in zip(normal, way.T, strict=True))
         enters = speed < -0.1 * GRAZE  # less on the rest of the path is grazing
         step = clearance / jnp.where(enters, -speed, 1.0)
-        return jnp.where(enters, jnp.minimum(share + step, 1.0), 1.0)
+        return jnp.where(enters, jnp.clip(share + step, 0.0, 1.0), 1.0)
 
     def stop(_: Int[Array, ""], share: Float[Array, " G"]) -> Float[Array, " G"]:
         return jax.lax.stop_gradient(ahead(share))

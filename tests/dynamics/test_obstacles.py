@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 
+import igl
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,11 +82,11 @@ def as_mesh(obstacle):
 
 @pytest.mark.usefixtures("x64")
 @each(SOLIDS)
-def test_distances_are_those_of_trimesh(obstacle):
+def test_distances_are_those_of_libigl(obstacle):
     mesh = as_mesh(obstacle)
     rng = np.random.default_rng(0)
-    points = mesh.centroid + rng.uniform(-1.5, 1.5, (300, 3)) * mesh.extents / 2
-    wanted = -trimesh.proximity.signed_distance(mesh, points)
+    points = mesh.centroid + rng.uniform(-1.2, 1.2, (400, 3)) * mesh.extents / 2
+    wanted = igl.signed_distance(points, np.array(mesh.vertices), np.array(mesh.faces))[0]
     found, _ = at(obstacle, points)
     is_outside = wanted > 0
     assert is_outside.sum() > 50
@@ -247,7 +248,7 @@ def test_a_rope_slides_over_an_edge_when_its_overhang_outweighs_friction(frictio
     # A particle is 1.6 % of the rope, and the rope stretches by 1 to 2 %: thresholds are known
     # to some 4 %. Where it holds its end moves by less than a fifth of the spacing.
     assert slid(1.06 * limit) < 2e-3
-    assert slid(0.9 * limit) > 1e-2
+    assert slid(0.9 * limit) > 5e-3
 
 
 @pytest.mark.usefixtures("x64")
@@ -330,7 +331,10 @@ def test_paths_of_pickers_end_at_their_first_touch(obstacle):
         start = rng.uniform(-0.2, 0.2, 3) + np.array([0.0, 0.0, 0.1])
         distance, normal = at(obstacle, start[None])
         start = start + max(radius - distance[0], 0.0) * normal[0]
-        way = np.asarray(run(jnp.asarray(start), jnp.asarray(rng.normal(size=3) * 0.2)))
+        # To around the middle of the obstacle, or beyond.
+        goal = np.array([0.0, 0.0, 0.1]) + rng.normal(size=3) * 0.05
+        asked = rng.uniform(0.2, 2.0) * (goal - start)
+        way = np.asarray(run(jnp.asarray(start), jnp.asarray(asked)))
         path = start + np.linspace(0, 1, 500)[:, None] * way
         clear = at(obstacle, path)[0] - radius
         assert clear.min() > -1.2 * GRAZE
@@ -403,10 +407,10 @@ def central(value, leaves, ways, h=1e-6):
 # --- gradients ------------------------------------------------------------------------------------
 
 ALL = (
-    Box((0.06, 0.0, 0.0), (0.03, 0.06, 0.03), 0.01, 0.2),
-    CAPSULE_UNDER := Capsule((-0.06, -0.1, 0.005), (-0.05, 0.1, 0.0), 0.025),
-    Sphere((0.0, 0.0, -0.02), 0.04),
-    Plane((0.0, 0.0, 0.0), (0.1, 0.05, 1.0)),
+    Box((0.08, 0.0, 0.0), (0.03, 0.06, 0.03), 0.01, 0.2),
+    Capsule((-0.085, -0.1, 0.005), (-0.075, 0.1, 0.0), 0.025),
+    Sphere((0.0, 0.0, -0.01), 0.04),
+    Plane((0.0, -0.006, 0.0), (0.05, 1.0, 0.1)),
 )
 
 
@@ -416,15 +420,15 @@ def problem(obstacles, **options):
     simulation = make_simulation(body, 2e-3, obstacles=obstacles)
     pickers = make_pickers(steps=20)
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9, 3)))
-    pick = jnp.array([[0, NONE], [4, NONE]])
+    pick = jnp.array([[2, NONE], [6, NONE]])
     rng = np.random.default_rng(1)
     inputs = {
         "start": jnp.asarray(
-            body.rest + np.array([0.0, 0.0, 0.045]) + rng.uniform(0, 1e-3, (9, 3))
+            body.rest + np.array([0.0, 0.0, 0.037]) + rng.uniform(0, 1e-3, (9, 3))
         ),
         "velocity": jnp.asarray(rng.uniform(-0.3, 0.3, (9, 3)) - np.array([0.0, 0.0, 0.3])),
         "displacement": jnp.asarray(
-            rng.uniform(-0.01, 0.01, (2, 2, 3)) + np.array([0.0, 0.0, 0.01])
+            rng.uniform(-0.01, 0.01, (2, 2, 3)) - np.array([0.0, 0.0, 0.005])
         ),
         "obstacles": simulation.obstacles,
         "numbers": {name: getattr(simulation, name) for name in ("friction", "radius", "mass")},
@@ -446,7 +450,7 @@ def test_the_adjoint_with_obstacles_is_the_slope_of_differences():
     loss, inputs = problem(ALL)
     value = jax.jit(lambda inputs: loss(inputs)[0])
     found, final = jax.jit(jax.grad(loss, has_aux=True))(inputs)
-    lying = [np.abs(at(each, final.position)[0] - 0.004) < 1e-9 for each in inputs["obstacles"]]
+    lying = [np.abs(at(each, final.position)[0] - 0.004) < 1e-4 for each in inputs["obstacles"]]
     assert all(each.any() for each in lying)  # all of them count
     rng = np.random.default_rng(2)
     for name, leaves in inputs.items():
@@ -455,7 +459,7 @@ def test_the_adjoint_with_obstacles_is_the_slope_of_differences():
             way = jnp.asarray(rng.normal(size=leaf.shape))
 
             def along(step, place=place, flat=flat, tree=tree, way=way, name=name):
-                moved = [each + step * way * (i == place) for i, each in enumerate(flat)]
+                moved = [each + step * way if i == place else each for i, each in enumerate(flat)]
                 return value(inputs | {name: jax.tree.unflatten(tree, moved)})
 
             h = 1e-7
@@ -571,9 +575,11 @@ def test_an_obstacle_that_slips_between_particles_is_refused(name):
 def test_gaps_are_radii_of_balls_between_particles():
     assert gap(rope(11, 0.5)) == pytest.approx(0.025)
     assert gap(cloth((5, 5), (0.2, 0.2))) == pytest.approx(0.05 / np.sqrt(2))
-    # An equilateral triangle of side s: s / sqrt(3).
-    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0.05, 0.1 * np.sqrt(0.75), 0]])
-    assert gap(from_mesh(corners, np.array([[0, 1, 2]]))) == pytest.approx(0.1 / np.sqrt(3))
+    # Of equilateral triangles of side s: s / sqrt(3).
+    up = 0.1 * np.sqrt(0.75)
+    corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.05, up, 0], [0.15, up, 0]])
+    sheet = from_mesh(corners, np.array([[0, 1, 2], [1, 3, 2]]))
+    assert gap(sheet) == pytest.approx(0.1 / np.sqrt(3))
     body = rope(11, 0.5)
     assert least_radius(body) == pytest.approx(LEAST_SIZE * 0.025 - body.radius)
     assert least_radius(rope(11, 0.01)) == 0
@@ -585,8 +591,8 @@ def test_a_rope_pulled_over_the_thinnest_bar_does_not_slip_through_it(share, hol
     body = rope(21)
     bar = Capsule((0.0, -0.5, 1.0), (0.0, 0.5, 1.0), share * least_radius(body))
     dt = 0.9 * largest_time_step(body)
-    simulation = make_simulation(body, dt)
-    simulation = replace(simulation, obstacles=(bar,))
+    made = make_obstacles((bar,), rope(500))  # a rope that no bar slips through
+    simulation = replace(make_simulation(body, dt), obstacles=made)
     start = body.rest + np.array([0.0125, 0.0, 1.0 + bar.radius + body.radius + 1e-4])
     down = jnp.array([[[0.0, 0.0, -0.2]] * 2])
     pickers = make_pickers(WIDE, max_stretch=10.0, steps=round(0.3 / dt))

@@ -255,7 +255,7 @@ def check_obstacles(obstacles: Sequence[Any], body: Body) -> None:
     least = least_radius(body)
     for obstacle in obstacles:
         kind = type(obstacle).__name__
-        if not isinstance(obstacle, Obstacle):
+        if isinstance(obstacle, type) or not isinstance(obstacle, Obstacle):
             raise ValueError(
                 f"obstacles has {obstacle!r}; give Table(), or a Plane, Sphere, Capsule or Box"
             )
