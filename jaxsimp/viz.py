@@ -244,15 +244,15 @@ def _surface(
     For the surface of a half-space, to points across the limits of the axes.
     """
     if np.isinf(obstacle.size()[1]):
-        x, y = np.meshgrid(*(np.linspace(*each, 9) for each in limits[:2]))
+        x, y = np.meshgrid(*(np.linspace(low, high, 9) for low, high in limits[:2]))
         around = np.stack([x, y, np.full_like(x, limits[2].mean())])
     else:
         azimuth, height = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
         flat = np.sin(height)
         around = FAR * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.cos(height)])
-    distance, normal = obstacle.distance(*around)
-    normal = np.stack([np.broadcast_to(each, distance.shape) for each in normal])
-    return around - distance * normal
+    found, normal = obstacle.distance(*around)
+    distance = np.asarray(found)[None]
+    return around - distance * np.stack([part * np.ones_like(distance[0]) for part in normal])
 
 
 def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import face_areas
 
+Values = Float[Array | np.ndarray, "..."] | float
 Axes = Sequence[Any]
 """Values of points along x, y and z, shape (*N,) each; a normal may have numbers among them."""
 Number = Float[Array | np.ndarray, "..."] | float | int
@@ -34,7 +35,7 @@ LEAST_SIZE = 2.0
 class Obstacle(Protocol):
     """A rigid, convex obstacle: a frozen dataclass whose leaves are its numbers."""
 
-    def distance(self, x: Array, y: Array, z: Array) -> tuple[Array, Axes]:
+    def distance(self, x: Values, y: Values, z: Values) -> tuple[Values, Axes]:
         """Signed distance, metres, negative inside, and outward unit normal, for each point."""
 
     def size(self) -> tuple[str, float]:
@@ -56,7 +57,7 @@ def _obstacle(kind: type) -> type:
 class Table:
     """The half-space below z = 0."""
 
-    def distance(self, x: Array, y: Array, z: Array) -> tuple[Array, Axes]:
+    def distance(self, x: Values, y: Values, z: Values) -> tuple[Values, Axes]:
         """See `Obstacle`."""
         return z, UP
 
@@ -78,7 +79,7 @@ class Plane:
     point: Vector
     normal: Vector
 
-    def distance(self, x: Array, y: Array, z: Array) -> tuple[Array, Axes]:
+    def distance(self, x: Values, y: Values, z: Values) -> tuple[Values, Axes]:
         """See `Obstacle`."""
         normal = jnp.asarray(self.normal, dtype=float)
         unit = list(normal * jax.lax.rsqrt(jnp.vdot(normal, normal)))
@@ -104,7 +105,7 @@ class Sphere:
     center: Vector
     radius: Number
 
-    def distance(self, x: Array, y: Array, z: Array) -> tuple[Array, Axes]:
+    def distance(self, x: Values, y: Values, z: Values) -> tuple[Values, Axes]:
         """See `Obstacle`."""
         return _grown(_from(self.center, x, y, z), self.radius)
 
@@ -128,7 +129,7 @@ class Capsule:
     end: Vector
     radius: Number
 
-    def distance(self, x: Array, y: Array, z: Array) -> tuple[Array, Axes]:
+    def distance(self, x: Values, y: Values, z: Values) -> tuple[Values, Axes]:
         """See `Obstacle`."""
         axis = list(jnp.asarray(self.end) - jnp.asarray(self.start))
         away = _from(self.start, x, y, z)
@@ -159,7 +160,7 @@ class Box:
     rounding: Number = 0.01
     turn: Number = 0.0
 
-    def distance(self, x: Array, y: Array, z: Array) -> tuple[Array, Axes]:
+    def distance(self, x: Values, y: Values, z: Values) -> tuple[Values, Axes]:
         """See `Obstacle`."""
         cos, sin = jnp.cos(self.turn), jnp.sin(self.turn)
         east, north, up = _from(self.center, x, y, z)
@@ -189,6 +190,10 @@ class Box:
                 f"smallest of half_sizes, {least:.4g} m"
             )
         return "half_sizes", least
+
+
+SHAPES = {shape.__name__: shape for shape in (Table, Plane, Sphere, Capsule, Box)}
+"""The shapes of obstacles, by name."""
 
 
 def table_with_edge(
@@ -312,7 +317,7 @@ def _told(value: Any) -> str:
     return numbers[0] if np.ndim(value) == 0 else f"({', '.join(numbers)})"
 
 
-def _from(origin: Vector, x: Array, y: Array, z: Array) -> list[Array]:
+def _from(origin: Vector, x: Values, y: Values, z: Values) -> list[Any]:
     """Coordinates relative to an origin."""
     return [x - origin[0], y - origin[1], z - origin[2]]
 
@@ -332,5 +337,5 @@ def _length(vector: Axes) -> tuple[Array, Axes]:
     return jnp.where(some, length, 0.0), unit
 
 
-def _dot(a: Axes, b: Axes) -> Array:
+def _dot(a: Axes, b: Axes) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
