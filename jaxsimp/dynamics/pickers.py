@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsimp.dynamics.contact.obstacles import Obstacle
+from jaxsimp.dynamics.contact.obstacles import Obstacle, Table
 
 NONE = -1
 """The particle id of a picker that grasps nothing (None in Eq. 1 of the paper)."""
@@ -92,10 +92,10 @@ def grasp(
     """Held particles during an action, and their displacements.
 
     `grasp` clips displacements to the limits, pushes targets out of obstacles along the normal,
-    and ends straight paths where they first touch an obstacle. If several pickers name a particle,
-    the first one holds it. Two pickers violate the stretch rule, C(a) < 0 of Eq. 2, if their
-    particles would end at `max_stretch` times their rest distance or farther; both then hold
-    still, so a third may violate the rule too. (On a straight path the distance of two particles
+    and ends straight paths at the limits, or where they first touch an obstacle. If several
+    pickers name a particle, the first one holds it. Two pickers violate the stretch rule,
+    C(a) < 0 of Eq. 2, if their particles would end at `max_stretch` times their rest distance or
+    farther; both then hold still, so a third may violate the rule too. (On a straight path the distance of two particles
     is convex in time, so it is never larger than at both ends.)
 
     Args:
@@ -114,9 +114,8 @@ def grasp(
     start = position[action.pick]
     target = start + jnp.clip(action.displacement, -pickers.limits[None], pickers.limits[None])
     target = _outside(obstacles, radius, target)
-    for obstacle in obstacles:
-        share = _clear_share(obstacle, radius, start, target)[:, None]
-        target = jnp.where(share < 1.0, start + share * (target - start), target)
+    if not all(isinstance(each, Table) for each in obstacles):  # no path is through the table alone
+        target = _cut(pickers, obstacles, radius, start, target)
     for _ in range(max(1, len(holds) - 1)):  # each pass that changes anything stops a picker
         allowed = _allowed(pickers, rest[action.pick], target, holds)
         target = jnp.where(allowed[:, None], target, start)
@@ -138,6 +137,23 @@ def _outside(
             for at, part in zip(target.T, normal, strict=True)
         ]
         target = jnp.stack(moved, axis=1)
+    return target
+
+
+def _cut(
+    pickers: Pickers,
+    obstacles: Sequence[Obstacle],
+    radius: Float[Array, ""],
+    start: Float[Array, "G 3"],
+    target: Float[Array, "G 3"],
+) -> Float[Array, "G 3"]:
+    """Ends of straight paths to targets: at the limits, or where they first touch an obstacle."""
+    way = target - start
+    excess = (jnp.abs(way) / pickers.limits[None]).max(axis=1, keepdims=True)
+    target = start + way / jnp.maximum(excess, 1.0)  # what pushed it out may have been large
+    for obstacle in obstacles:
+        share = _clear_share(obstacle, radius, start, target)[:, None]
+        target = jnp.where(share < 1.0, start + share * (target - start), target)
     return target
 
 

@@ -363,6 +363,18 @@ def test_a_target_inside_is_pushed_out_and_slides_along_a_face():
     np.testing.assert_allclose(through, 0.0, rtol=0, atol=2 * GRAZE)
 
 
+def test_a_target_that_is_pushed_out_far_stays_within_the_limits():
+    # The nearest way out of the block is 0.17 m up, and the limit along z is 0.1 m.
+    block = Box((0.0, 0.0, 0.0), (1.0, 1.0, 0.3), 0.01)
+    position = jnp.array([[-1.1, 0.0, 0.15], [9.0, 9.0, 9.0]])
+    action = Actions(jnp.array([0]), jnp.array([[0.5, 0.0, 0.0]]))
+    around = position, (block,), jnp.asarray(0.004)
+    _, moves = grasp(make_pickers((0.5, 0.5, 0.1)), *around, position, action)
+    assert np.abs(moves[0, 2]) <= 0.1
+    end = position[0] + moves[0]
+    assert at(block, end[None])[0][0] == pytest.approx(0.004, abs=2 * GRAZE)  # at the side
+
+
 def test_with_the_table_alone_displacements_are_clipped_as_a_maximum_of_heights():
     rng = np.random.default_rng(0)
     start = rng.uniform(-0.2, 0.2, (500, 3)) * [1, 1, 0] + np.array([0, 0, 0.004])
