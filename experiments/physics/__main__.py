@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from experiments.physics import against_mujoco, resolution, self_contact, swings
+from experiments.physics import against_mujoco, obstacles, resolution, self_contact, swings
 from jaxsimp.cli.status import exit_status
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ FIGURES: "dict[str, Callable[[bool], tuple[Figure, str]]]" = {
     "time_step": swings.plot_time_step,
     "resolution": resolution.plot_resolution,
     "energy": swings.plot_energy,
+    "obstacles": obstacles.plot_obstacles,
     "mujoco": against_mujoco.plot_mujoco,
     "self_contact": self_contact.plot_self_contact,
 }
@@ -27,7 +28,7 @@ FIGURES: "dict[str, Callable[[bool], tuple[Figure, str]]]" = {
 
 @dataclass(frozen=True)
 class Options:
-    """Figures of the physics page: convergence, energy, MuJoCo beside ours, and self-contact."""
+    """Figures of the physics page: convergence, energy, obstacles, MuJoCo, and self-contact."""
 
     out: Path = Path("docs/figures")
     """Folder of the figures, created if missing."""

@@ -95,8 +95,8 @@ def grasp(
     and ends straight paths at the limits, or where they first touch an obstacle. If several
     pickers name a particle, the first one holds it. Two pickers violate the stretch rule,
     C(a) < 0 of Eq. 2, if their particles would end at `max_stretch` times their rest distance or
-    farther; both then hold still, so a third may violate the rule too. (On a straight path the distance of two particles
-    is convex in time, so it is never larger than at both ends.)
+    farther; both then hold still, so a third may violate the rule too. (On a straight path the
+    distance of two particles is convex in time, so it is never larger than at both ends.)
 
     Args:
         pickers: limits of the pickers' motion.

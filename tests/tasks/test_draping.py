@@ -1,31 +1,26 @@
 """A towel hung over a bar: its goal in closed form, and a plan by hand that hangs it."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.scripted import scripted_plan
 from jaxsimp.bodies import cloth
-from jaxsimp.dynamics import Actions, Capsule, Table, least_radius, settle
+from jaxsimp.dynamics import Capsule, Table, least_radius, settle
 from jaxsimp.dynamics.simulation import at_rest
 from jaxsimp.engines import MassSprings
-from jaxsimp.tasks import Task, make_task, score
+from jaxsimp.tasks import make_task, score
 from jaxsimp.tasks.draping import HEIGHT, hung_over
-
-
-def by_hand(task: Task) -> Actions:
-    """Lift the edge beside the bar, draw it over the bar, and bring it down on the other side."""
-    side = task.resolution
-    edge = np.array([side * side - side, side * side - 1])
-    way = (np.asarray(task.goal) - task.episode_fn(0).start)[edge]
-    up, over = np.array([0.08, 0.0, 0.28]), np.array([0.22, 0.0, 0.0])
-    moves = np.stack([np.tile(up, (2, 1)), np.tile(over, (2, 1)), way - up - over])
-    return Actions(jnp.tile(jnp.asarray(edge), (3, 1)), jnp.asarray(moves, dtype=float))
 
 
 @pytest.mark.parametrize("self_contact", [False, True])
 def test_a_plan_by_hand_hangs_the_towel(self_contact):
     task = make_task("towel_over_bar", quick=True)
-    found = MassSprings(self_contact).executor(task)(task.episode_fn(0), by_hand(task))
+    found = MassSprings(self_contact).executor(task)(
+        task.episode_fn(0), scripted_plan(task, task.episode_fn(0))
+    )
     assert found.score >= 0.9
     # It hangs: round the bar on both sides, and clear of the table.
     bar = task.obstacles[0]
@@ -37,11 +32,11 @@ def test_a_plan_by_hand_hangs_the_towel(self_contact):
 
 
 def test_without_the_bar_the_plan_fails():
-    import dataclasses
-
     task = make_task("towel_over_bar", quick=True)
     bare = dataclasses.replace(task, obstacles=(Table(),))
-    found = MassSprings().executor(bare)(task.episode_fn(0), by_hand(task))
+    found = MassSprings().executor(bare)(
+        task.episode_fn(0), scripted_plan(task, task.episode_fn(0))
+    )
     assert found.score < 0.7
 
 
