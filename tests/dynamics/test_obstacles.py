@@ -363,16 +363,18 @@ def test_a_target_inside_is_pushed_out_and_slides_along_a_face():
     np.testing.assert_allclose(through, 0.0, rtol=0, atol=2 * GRAZE)
 
 
-def test_a_target_that_is_pushed_out_far_stays_within_the_limits():
-    # The nearest way out of the block is 0.17 m up, and the limit along z is 0.1 m.
-    block = Box((0.0, 0.0, 0.0), (1.0, 1.0, 0.3), 0.01)
-    position = jnp.array([[-1.1, 0.0, 0.15], [9.0, 9.0, 9.0]])
-    action = Actions(jnp.array([0]), jnp.array([[0.5, 0.0, 0.0]]))
-    around = position, (block,), jnp.asarray(0.004)
-    _, moves = grasp(make_pickers((0.5, 0.5, 0.1)), *around, position, action)
-    assert np.abs(moves[0, 2]) <= 0.1
-    end = position[0] + moves[0]
-    assert at(block, end[None])[0][0] == pytest.approx(0.004, abs=2 * GRAZE)  # at the side
+def test_a_target_that_is_pushed_out_stays_within_the_limits():
+    # Nearly along a tangent of a ball; the target, just inside, is pushed up by 0.09 m.
+    ball = Sphere((0.0, 0.0, 0.0), 0.996)
+    position = jnp.array([[-1.073, 0.0, 0.59], [9.0, 9.0, 9.0]])
+    action = Actions(jnp.array([0]), jnp.array([[0.673, 0.0, 0.21]]))
+    around = position, (ball,), jnp.asarray(0.004)
+    moves = [grasp(make_pickers((1.0, 1.0, z)), *around, position, action)[1] for z in (0.22, 0.5)]
+    assert moves[1][0, 2] > 0.29
+    assert 0.2 < moves[0][0, 2] <= 0.22 * (1 + 1e-6)
+    np.testing.assert_allclose(
+        moves[0][0] / moves[0][0, 2], moves[1][0] / moves[1][0, 2], rtol=1e-5
+    )
 
 
 def test_with_the_table_alone_displacements_are_clipped_as_a_maximum_of_heights():
@@ -529,6 +531,31 @@ def test_without_a_table_there_is_no_floor():
         final = jit_settle(simulation, at_rest(goals.flat(body)), 100)
         fallen = -9.81 * 1e-6 * 100 * 101 / 2  # semi-implicit Euler
         np.testing.assert_allclose(final.position[:, 2], body.radius + fallen, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("obstacles", "is_free"), [((), True), ((Table(),), False)])
+def test_layers_below_the_height_of_the_table_part_evenly_without_one(obstacles, is_free):
+    one = cloth((5, 5), (0.05, 0.05), drag=0.0)
+    twice = ("mass", "families", "rest_length", "stiffness", "damping")
+    apart = np.array([0.0, 0.0, 0.003])  # of a thickness of 4 mm
+    body = replace(
+        one,
+        rest=np.concatenate([one.rest, one.rest + apart]),
+        springs=np.concatenate([one.springs, one.springs + 25]),
+        faces=np.concatenate([one.faces, one.faces + 25]),
+        shape=(50,),
+        **{name: np.tile(getattr(one, name), 2) for name in twice},
+    )
+    start = body.rest - np.array([0.0, 0.0, 1e-3])  # the lower layer; a table is at its radius
+    simulation = make_simulation(body, 1e-3, 0.0, obstacles=obstacles, self_contact=True)
+    final = jit_settle(simulation, at_rest(start), 1)
+    lower, upper = (np.asarray(final.position)[half, 2] for half in (slice(25), slice(25, 50)))
+    assert upper.mean() - lower.mean() > 0.0035
+    moved = (lower - start[:25, 2]).mean()
+    if is_free:
+        assert moved == pytest.approx(-(upper - start[25:, 2]).mean(), rel=1e-3)
+    else:
+        assert moved > 0  # the table lifts it
 
 
 # --- the door -------------------------------------------------------------------------------------
