@@ -1,6 +1,7 @@
 """Obstacles: distances, contact, friction, the pickers' door and gradients, against oracles."""
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import igl
 import jax
@@ -34,6 +35,7 @@ from jaxsimp.dynamics import (
     table_with_edge,
 )
 from jaxsimp.dynamics.contact.obstacles import LEAST_SIZE, gap, make_obstacles
+from jaxsimp.dynamics.contact.rigid import contact
 from jaxsimp.dynamics.pickers import GRAZE, grasp
 
 jit_settle = jax.jit(settle, static_argnames="num_steps")
@@ -283,6 +285,58 @@ def test_a_rope_over_a_cylinder_holds_up_to_the_ratio_of_the_capstan(friction):
     assert slides(1.06 * threshold) > 2e-3
 
 
+def of_heights(simulation, position, velocity):
+    """Contact with the table alone, written out."""
+    x, y, z = velocity
+    above = position[2] - simulation.radius
+    along = jnp.maximum(z, -above * (1.0 / simulation.time_step))
+    squared = x * x + y * y
+    slowdown = simulation.friction * (along - z)
+    slowdown = slowdown * jax.lax.rsqrt(jnp.maximum(squared, 1e-12))
+    kept = jnp.maximum(0.0, 1.0 - slowdown)
+    return [x * kept, y * kept, along]
+
+
+def test_the_table_alone_is_the_arithmetic_of_heights_and_nothing_else():
+    # The same program, and so the same bits and cost, forwards and backwards.
+    simulation = make_simulation(rope(5), 1e-3)
+    rows = [jnp.asarray(row) for row in np.random.default_rng(0).normal(size=(6, 5, 3))]
+
+    def backwards(run, *rows):
+        after, pullback = jax.vjp(lambda *rows: run(simulation, [*rows[:3]], [*rows[3:]]), *rows)
+        return pullback(after)
+
+    found, wanted = (
+        str(jax.make_jaxpr(partial(backwards, run))(*rows)) for run in (contact, of_heights)
+    )
+    assert found == wanted
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ceiling:
+    """An obstacle of one's own: everything above a height."""
+
+    height: float
+
+    def distance(self, x, y, z):
+        return self.height - z, (0.0, 0.0, -1.0)
+
+    def size(self):
+        return "height", np.inf
+
+
+def test_an_obstacle_of_ones_own_acts_and_stops_pickers():
+    body = rope(5, 0.1)
+    simulation = make_simulation(body, 1e-3, obstacles=(Ceiling(0.3), Table()))
+    start = State(jnp.asarray(body.rest + np.array([0, 0, 0.2]), float), jnp.full((5, 3), 3.0))
+    final = jit_settle(simulation, start, 100)
+    assert float(final.position[:, 2].max()) == pytest.approx(0.3 - body.radius, abs=2e-2)
+    assert float(final.position[:, 2].max()) <= 0.3 - body.radius + 1e-6
+    way = moved((Ceiling(0.3), Table()), (0.0, 0.0, 0.1), (0.1, 0.0, 0.5))
+    np.testing.assert_allclose(way, [0.1, 0.0, 0.2 - 0.004], rtol=0, atol=2 * GRAZE)
+
+
 def test_the_table_does_not_depend_on_company_that_is_far_away():
     body = cloth((5, 5), (0.1, 0.1))
     far = Sphere((5.0, 0.0, 0.0), 0.5)
@@ -319,7 +373,7 @@ def moved(obstacles, start, displacement, radius=0.004):
 
 
 @pytest.mark.usefixtures("x64")
-@each(EVERY)
+@each(SOLIDS | {"plane": SLOPE})
 def test_paths_of_pickers_end_at_their_first_touch(obstacle):
     radius = 0.004
     run = jax.jit(lambda start, way: moved((obstacle,), start, way))
@@ -341,7 +395,8 @@ def test_paths_of_pickers_end_at_their_first_touch(obstacle):
         counts[int(clear[-1] < 1e-4 and np.linalg.norm(way) > 0)] += 1
 
     check()
-    assert counts.min() > 0  # some end at the obstacle, some do not
+    # Some end at the obstacle, some do not: at a rate of a third or more each, of 25 examples.
+    assert counts.min() > 0
 
 
 def test_a_path_through_a_sphere_is_cut_where_a_line_meets_it():

@@ -24,6 +24,8 @@ Axes = Sequence[Any]
 """Values of points along x, y and z, shape (*N,) each; a normal may have numbers among them."""
 Number = Float[Array | np.ndarray, "..."] | float | int
 Vector = Float[Array | np.ndarray, "... 3"] | tuple[float | int, float | int, float | int]
+SHAPES_OF_NUMBERS: dict[Any, tuple[int, ...]] = {Number: (), Vector: (3,)}
+"""Shapes of an obstacle's numbers by the annotation of their field; any for another."""
 
 UP = (0.0, 0.0, 1.0)
 """The constant normal of the table: contact along it is arithmetic of heights alone."""
@@ -46,13 +48,7 @@ class Obstacle(Protocol):
         """
 
 
-def _obstacle(kind: type) -> type:
-    """Register a dataclass whose fields are all leaves."""
-    names = [field.name for field in dataclasses.fields(kind)]
-    return jax.tree_util.register_dataclass(kind, data_fields=names, meta_fields=[])
-
-
-@_obstacle
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Table:
     """The half-space below z = 0."""
@@ -66,7 +62,7 @@ class Table:
         return "", np.inf
 
 
-@_obstacle
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Plane:
     """The half-space behind a plane.
@@ -92,7 +88,7 @@ class Plane:
         return "", np.inf
 
 
-@_obstacle
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sphere:
     """A sphere.
@@ -114,7 +110,7 @@ class Sphere:
         return "radius", _positive("radius", self.radius)
 
 
-@_obstacle
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Capsule:
     """A cylinder with hemispherical ends, such as a bar.
@@ -143,7 +139,7 @@ class Capsule:
         return "radius", _positive("radius", self.radius)
 
 
-@_obstacle
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Box:
     """A box with rounded edges, turned about z.
@@ -295,9 +291,11 @@ def _numbers(obstacle: Any) -> dict[str, np.ndarray]:
     numbers = {}
     for field in dataclasses.fields(obstacle):
         value = np.asarray(getattr(obstacle, field.name), dtype=float)
-        shape = () if field.type is Number else (3,)
+        shape = SHAPES_OF_NUMBERS.get(field.type, value.shape)
         if value.shape != shape or not np.isfinite(value).all():
-            wanted = "a finite number" if shape == () else "three finite numbers"
+            wanted = {(): "a finite number", (3,): "three finite numbers"}.get(
+                shape, "finite numbers"
+            )
             raise ValueError(f"{field.name} is {_told(value)}; give {wanted}")
         numbers[field.name] = value
     return numbers

@@ -91,7 +91,7 @@ def replay(
         )
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
     model = make_model(task.body, variant, picked, obstacles=task.obstacles)
-    one = partial(_replay_one, task, model, jax.jit(partial(score, task)))
+    one = partial(_replay_one, task, task.simulation(), model, jax.jit(partial(score, task)))
     return _side_by_side(one, episodes, plans, num_workers or num_cores())
 
 
@@ -107,13 +107,14 @@ def _side_by_side(
 
 def _replay_one(
     task: Task,
+    simulation: Simulation,
     model: Any,
     score_fn: Callable[[Episode, Float[Array, "N 3"]], Float[Array, ""]],
     episode: Episode,
     plan: Actions,
 ) -> Execution:
     """Carry out one plan."""
-    scene = _Scene(task, model, np.asarray(episode.start, dtype=float))
+    scene = _Scene(task, simulation, model, np.asarray(episode.start, dtype=float))
     frames = [scene.positions()]
     for pick, displacement in zip(
         np.asarray(plan.pick), np.asarray(plan.displacement), strict=True
@@ -131,14 +132,16 @@ def _replay_one(
 class _Scene:
     """One simulation and the actions of pickers in it."""
 
-    def __init__(self, task: Task, model: Any, start: Float[np.ndarray, "N 3"]) -> None:
+    def __init__(
+        self, task: Task, simulation: Simulation, model: Any, start: Float[np.ndarray, "N 3"]
+    ) -> None:
         import mujoco
 
-        self._task, self._model, self._data = task, model, mujoco.MjData(model)
+        self._task, self._simulation = task, simulation  # of which the pickers' rules count
+        self._model, self._data = model, mujoco.MjData(model)
         self._data.qpos[:] = (start - task.body.rest).ravel()
         self._steps = max(1, round(task.action_seconds / model.opt.timestep))
         self._pickers = make_pickers(task.limits, steps=self._steps)
-        self._simulation = task.simulation()  # for the pickers' rules alone
         speed = np.asarray(speed_profile(self._steps), dtype=float)
         self._ahead = np.cumsum(speed) + (LEAD - 1) * speed
         self.unstable = False
