@@ -112,7 +112,7 @@ def to_mjx(model: Any) -> Any:
 
 
 def mjx_accelerations(simulation: MJXSimulation, state: State) -> Float[Array, "N 3"]:
-    """Accelerations without table and pickers, metres per second squared."""
+    """Accelerations without obstacles and pickers, metres per second squared."""
     data = _mjx().forward(simulation.model, _loaded(simulation, state))
     return data.qacc.reshape(state.position.shape)
 
@@ -120,7 +120,7 @@ def mjx_accelerations(simulation: MJXSimulation, state: State) -> Float[Array, "
 def mjx_trajectory(
     simulation: MJXSimulation, state: State, num_steps: int
 ) -> tuple[State, Float[Array, "T N 3"]]:
-    """Motion by MJX alone, without table and pickers.
+    """Motion by MJX alone, without obstacles and pickers.
 
     Returns:
         States after each of `num_steps` steps, and the accelerations in those steps, stacked along
