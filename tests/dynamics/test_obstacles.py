@@ -682,6 +682,9 @@ def test_gaps_are_radii_of_balls_between_particles():
     corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.05, up, 0], [0.15, up, 0]])
     sheet = from_mesh(corners, np.array([[0, 1, 2], [1, 3, 2]]))
     assert gap(sheet) == pytest.approx(0.1 / np.sqrt(3))
+    # Of three particles in a line, half their distance.
+    line = replace(sheet, rest=corners * [1.0, 0, 0])
+    assert gap(line) == pytest.approx(0.05)
     body = rope(11, 0.5)
     assert least_radius(body) == pytest.approx(LEAST_SIZE * 0.025 - body.radius)
     assert least_radius(rope(11, 0.01)) == 0

@@ -220,9 +220,9 @@ def gap(body: Body) -> float:
     corners = body.rest[body.faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     longest = sides.max(axis=1)
-    around = sides.prod(axis=1) / (4 * face_areas(body.rest, body.faces))
     obtuse = 2 * longest**2 > (sides**2).sum(axis=1) * (1 + 1e-9)
-    return float(np.where(obtuse, longest / 2, around).max())
+    area = np.where(obtuse, 1.0, face_areas(body.rest, body.faces))  # which may be 0
+    return float(np.where(obtuse, longest / 2, sides.prod(axis=1) / (4 * area)).max())
 
 
 def least_radius(body: Body) -> float:
@@ -253,9 +253,7 @@ def check_obstacles(obstacles: Sequence[Any], body: Body) -> None:
         ValueError: if an entry is no obstacle, a number has another shape, is not finite or out
             of its range, or an obstacle is smaller than `least_radius` of the body.
     """
-    least = least_radius(body)
     for obstacle in obstacles:
-        kind = type(obstacle).__name__
         if isinstance(obstacle, type) or not isinstance(obstacle, Obstacle):
             raise ValueError(
                 f"obstacles has {obstacle!r}; give Table(), or a Plane, Sphere, Capsule or Box"
@@ -263,13 +261,24 @@ def check_obstacles(obstacles: Sequence[Any], body: Body) -> None:
         try:
             name, size = _changed(obstacle, _numbers(obstacle)).size()
         except ValueError as error:
-            raise ValueError(f"{kind}: {error}") from error
-        if size < least * (1 - 1e-6):  # rounding of float32
-            raise ValueError(
-                f"{kind}: {name} is {size:.4g} m; the particles of this {body.name} leave gaps of "
-                f"radius {gap(body):.4g} m, through which obstacles thinner than "
-                f"{least * (1 + 5e-4):.4g} m slip. Give at least that, or a body of more particles"
-            )
+            raise ValueError(f"{type(obstacle).__name__}: {error}") from error
+        if np.isfinite(size):
+            _check_size(f"{type(obstacle).__name__}: {name}", size, body)
+
+
+def _check_size(name: str, size: float, body: Body) -> None:
+    """Check that an obstacle does not slip between a body's particles.
+
+    Raises:
+        ValueError: if it does.
+    """
+    least = least_radius(body)
+    if size < least * (1 - 1e-6):  # rounding of float32
+        raise ValueError(
+            f"{name} is {size:.4g} m; the particles of this {body.name} leave gaps of radius "
+            f"{gap(body):.4g} m, through which obstacles thinner than {least * (1 + 5e-4):.4g} m "
+            f"slip. Give at least that, or a body of more particles"
+        )
 
 
 def has_table(obstacles: Sequence[Obstacle]) -> bool:
