@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from jaxsimp import goals
-from jaxsimp.bodies import cloth, from_mesh, rope
+from jaxsimp.bodies import cloth, from_mesh, rope, rope_along
 from jaxsimp.dynamics import (
     NONE,
     Actions,
@@ -676,6 +676,8 @@ def test_an_obstacle_that_slips_between_particles_is_refused(name):
 
 def test_gaps_are_radii_of_balls_between_particles():
     assert gap(rope(11, 0.5)) == pytest.approx(0.025)
+    uneven = rope_along(np.array([[0.0, 0, 0], [0.1, 0, 0], [0.4, 0, 0], [0.5, 0, 0]]))
+    assert gap(uneven) == pytest.approx(0.15)
     assert gap(cloth((5, 5), (0.2, 0.2))) == pytest.approx(0.05 / np.sqrt(2))
     # Of equilateral triangles of side s: s / sqrt(3).
     up = 0.1 * np.sqrt(0.75)

@@ -17,9 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp.bodies import Body
+from jaxsimp.bodies.material import FAMILIES
 from jaxsimp.bodies.meshes import face_areas
 
 Values = Float[Array | np.ndarray, "..."] | float
+"""One number for each point."""
 Axes = Sequence[Any]
 """Values of points along x, y and z, shape (*N,) each; a normal may have numbers among them."""
 Number = Float[Array | np.ndarray, "..."] | float | int
@@ -27,6 +29,8 @@ Vector = Float[Array | np.ndarray, "... 3"] | tuple[float | int, float | int, fl
 SHAPES_OF_NUMBERS: dict[Any, tuple[int, ...]] = {Number: (), Vector: (3,)}
 """Shapes of an obstacle's numbers by the annotation of their field; any for another."""
 
+STRETCH = FAMILIES.index("stretch_stiffness")
+"""The family of springs that are a rope's links."""
 UP = (0.0, 0.0, 1.0)
 """The constant normal of the table: contact along it is arithmetic of heights alone."""
 LEAST_SIZE = 2.0
@@ -214,9 +218,7 @@ def gap(body: Body) -> float:
     longest side of an obtuse one.
     """
     if not len(body.faces):
-        shortest = np.full(body.num_particles, np.inf)
-        np.minimum.at(shortest, body.springs, body.rest_length[:, None])
-        return float(shortest[np.isfinite(shortest)].max(initial=0.0)) / 2
+        return float(body.rest_length[body.families == STRETCH].max(initial=0.0)) / 2
     corners = body.rest[body.faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     longest = sides.max(axis=1)
