@@ -132,10 +132,9 @@ def test_a_plan_meets_the_same_obstacle_in_mujoco():
     wall = task.obstacles[0]
     assert float(wall.distance(*held)[0]) == pytest.approx(task.body.radius, abs=1e-3)
     assert held[2] > 0.03
-    # Let go, the rope lies over it.
-    settled = found.positions[-1]
-    assert settled[10, 2] > 0.03
-    assert np.asarray(wall.distance(*settled.T)[0]).min() > task.body.radius - 1e-3
+    # The rest of the rope, which hangs down from there, is at the wall and not in it.
+    clear = np.asarray(wall.distance(*found.positions[2, :10].T)[0]) - task.body.radius
+    assert -1e-3 < clear.min() < 3e-3
     bare = replace(task, obstacles=(Table(),))
     (found,) = replay(bare, [episode], [plan])
     assert found.positions[2, 10, 2] == pytest.approx(task.body.radius, abs=1e-3)
