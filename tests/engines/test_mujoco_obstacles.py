@@ -134,7 +134,7 @@ def test_a_plan_meets_the_same_obstacle_in_mujoco():
     assert held[2] > 0.03
     # The rest of the rope, which hangs down from there, is at the wall and not in it.
     clear = np.asarray(wall.distance(*found.positions[2, :10].T)[0]) - task.body.radius
-    assert -1e-3 < clear.min() < 3e-3
+    assert -2.5e-3 < clear.min() < 3e-3  # pulled taut into a soft contact; 4 mm is the radius
     bare = replace(task, obstacles=(Table(),))
     (found,) = replay(bare, [episode], [plan])
     assert found.positions[2, 10, 2] == pytest.approx(task.body.radius, abs=1e-3)
