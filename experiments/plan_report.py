@@ -43,7 +43,7 @@ def write_report(study: PlanStudy, summary: dict[str, Any], folder: Path) -> Non
         plans = _typical_plans(_of(rows, task=name), folder)
         seed = _typical_seed(_of(rows, task=name))
         goal = np.asarray(task.episode_fn(seed).goal)
-        figure = viz.plot_executions(task.body, goal, plans, name)
+        figure = viz.plot_executions(task.body, goal, plans, name, task.obstacles)
         save_figure(figure, figures / f"plans_{name}.png")
     replays = folder / TRANSFER_FILE
     transfer = json.loads(replays.read_text()) if replays.exists() else []

@@ -1,4 +1,4 @@
-"""Hand-made plans of the paper's tasks, as a reference for the score of a known good fold or pull.
+"""Hand-made plans of some tasks, as a reference for the score of a known good fold or pull.
 
 A plan found by a search may fail in another engine because the search exploited its own. A
 hand-made plan fails only if the engines differ.
@@ -20,7 +20,7 @@ Moves = dict[int, Float[np.ndarray, "3"]]
 
 
 def scripted_plan(task: Task, episode: Episode) -> Actions:
-    """The hand-made plan of one of the paper's tasks.
+    """The hand-made plan of a task.
 
     Raises:
         ValueError: if the task has no hand-made plan.
@@ -61,6 +61,15 @@ def _fold_diagonally(task: Task, episode: Episode) -> list[Moves]:
     return _carry_over(task, episode, (0,))
 
 
+def _hang_over_bar(task: Task, episode: Episode) -> list[Moves]:
+    """Lift the edge beside the bar, draw it over the bar, and bring it down on the other side."""
+    last, width = task.body.num_particles - 1, task.body.shape[1]
+    way, up, over = _ways(episode), np.array([0.08, 0.0, 0.28]), np.array([0.22, 0.0, 0.0])
+    edge = (last - width + 1, last)
+    down = {corner: way[corner] - up - over for corner in edge}
+    return [dict.fromkeys(edge, up), dict.fromkeys(edge, over), down]
+
+
 def _carry_over(task: Task, episode: Episode, corners: tuple[int, ...]) -> list[Moves]:
     """Move up and half the way, then the other half and down to just above the layer below."""
     way, up = _ways(episode), np.array([0.0, 0.0, APEX])
@@ -91,5 +100,6 @@ SCRIPTS: dict[str, Callable[[Task, Episode], list[Moves]]] = {
     "rope_folding": _fold_rope,
     "cloth_side_folding": _fold_sideways,
     "cloth_diagonal_folding": _fold_diagonally,
+    "towel_over_bar": _hang_over_bar,
 }
 """Functions that make the moves of each action, by task."""

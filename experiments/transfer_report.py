@@ -79,7 +79,10 @@ def _picture(study: TransferStudy, folder: Path, row: dict[str, Any], name: str)
     goal = np.asarray(task.episode_fn(row["seed"]).goal)
     title = f"{row['task']}, {LABELS[row['action_space']]}, seed {row['seed']}"
     file = f"{name}.png"
-    save_figure(viz.plot_executions(task.body, goal, motions, title), folder / "figures" / file)
+    save_figure(
+        viz.plot_executions(task.body, goal, motions, title, task.obstacles),
+        folder / "figures" / file,
+    )
     return file
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.topology import boundary_edges
+from jaxsimp.dynamics import Obstacle, Table
 from jaxsimp.simplification import FitStatus, KeyPoints
 
 if TYPE_CHECKING:
@@ -17,7 +18,9 @@ if TYPE_CHECKING:
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 """Colours distinct for colour-blind readers (Okabe and Ito)."""
-GOAL_COLOR = "#999999"
+GOAL_COLOR, OBSTACLE_COLOR = "#999999", "#e6c27a"
+FAR = 10.0
+"""Distance from which the surfaces of obstacles are looked at, metres."""
 Positions = Float[np.ndarray, "N 3"]
 
 
@@ -137,6 +140,7 @@ def plot_executions(
     goal: Positions,
     executions: Mapping[str, tuple[Float[np.ndarray, "P N 3"], float]],
     title: str,
+    obstacles: Sequence[Obstacle] = (),
 ) -> "Figure":
     """Snapshots of executed plans beside their goal, one row per plan (Fig. 5 of the paper).
 
@@ -146,6 +150,7 @@ def plot_executions(
         executions: by method, positions at the start, after each action, and settled, shape
             (P, N, 3), metres; and the score.
         title: title of the figure.
+        obstacles: obstacles of the task, see `draw_obstacle`.
     """
     import matplotlib.pyplot as plt
 
@@ -170,6 +175,8 @@ def plot_executions(
         for axes, frame, name in zip(row, frames, names, strict=True):
             draw_body(axes, body, frame, GOAL_COLOR if name == "goal" else COLORS[0])
             _frame(axes, every)
+            for obstacle in obstacles:
+                draw_obstacle(axes, obstacle)
             axes.set_title(name, fontsize="small")
         row[0].text2D(
             0.0, 1.12, method, transform=row[0].transAxes, weight="bold", fontsize="small"
@@ -209,6 +216,43 @@ def draw_body(axes: "Axes3D", body: Body, positions: Positions, color: str) -> N
     else:
         axes.plot(*positions.T, color=color, lw=3, solid_capstyle="round")
         axes.scatter(*positions[[0, -1]].T, color=color, s=25, depthshade=False)
+
+
+def draw_obstacle(axes: "Axes3D", obstacle: Obstacle, color: str = OBSTACLE_COLOR) -> None:
+    """Draw the shaded surface of an obstacle into 3-D axes, within their limits.
+
+    Not of the table, which is the bottom of the picture.
+
+    Args:
+        axes: axes with a 3-D projection and limits.
+        obstacle: the obstacle to draw.
+        color: colour of the surface.
+    """
+    if isinstance(obstacle, Table):
+        return
+    limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
+    low, high = limits.T[:, :, None, None]
+    x, y, z = np.clip(_surface(obstacle, limits), low, high)
+    axes.plot_surface(x, y, z, color=color, alpha=0.5, lw=0, rstride=1, cstride=1, shade=True)
+
+
+def _surface(
+    obstacle: Obstacle, limits: Float[np.ndarray, "3 2"]
+) -> Float[np.ndarray, "3 rows columns"]:
+    """A grid of points on the surface of an obstacle: the nearest to points all around.
+
+    For the surface of a half-space, to points across the limits of the axes.
+    """
+    if np.isinf(obstacle.size()[1]):
+        x, y = np.meshgrid(*(np.linspace(low, high, 9) for low, high in limits[:2]))
+        around = np.stack([x, y, np.full_like(x, limits[2].mean())])
+    else:
+        azimuth, height = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
+        flat = np.sin(height)
+        around = FAR * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.cos(height)])
+    found, normal = obstacle.distance(*around)
+    distance = np.asarray(found)[None]
+    return around - distance * np.stack([part * np.ones_like(distance[0]) for part in normal])
 
 
 def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -> None:
@@ -254,13 +298,13 @@ def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.1) -> Non
     points = np.concatenate(shown)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
-    low[2], high[2] = 0.0, max(high[2], 1e-3)
+    low[2], high[2] = min(low[2], 0.0), max(high[2], 1e-3)
     span = np.maximum(high - low, 0.05 * np.ptp(points))
     middle = (low + high) / 2
     axes.set(
         xlim=(middle[0] - span[0] / 2, middle[0] + span[0] / 2),
         ylim=(middle[1] - span[1] / 2, middle[1] + span[1] / 2),
-        zlim=(0, span[2]),
+        zlim=(low[2], low[2] + span[2]),
     )
     # Matplotlib scales the box by its diagonal; the zoom of a square would cut off a long one.
     slender = np.linalg.norm(span) / (np.sqrt(2) * span.max())

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from scipy import stats
 
 from jaxsimp import goals, viz
 from jaxsimp.bodies import cloth, from_mesh, rope
 from jaxsimp.bodies.garments import skirt
 from jaxsimp.bodies.topology import boundary_edges
+from jaxsimp.dynamics import Box, Capsule, Plane, Sphere, Table, table_with_edge
 from jaxsimp.simplification import FitStatus, KeyPoints
 
 
@@ -187,6 +188,58 @@ def test_executions_are_drawn_frame_by_frame(body):
     assert len(limits) == 1  # one scale: frames can be compared
     for axes, frame in zip(figure.axes, [*frames, start] * 2, strict=True):
         assert_is_at(axes, body, frame)
+    figure.canvas.draw()
+
+
+OBSTACLES = {
+    "sphere": Sphere((0.02, 0.01, 0.04), 0.05),
+    "capsule": Capsule((-0.05, 0.0, 0.05), (0.06, 0.01, 0.06), 0.03),
+    "box": Box((0.0, 0.02, 0.05), (0.06, 0.03, 0.04), 0.01, 0.4),
+    "plane": Plane((0.0, 0.0, 0.05), (0.3, 0.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize("obstacle", OBSTACLES.values(), ids=OBSTACLES.keys())
+def test_an_obstacle_is_drawn_where_its_surface_is(obstacle):
+    axes = plt.figure().add_subplot(projection="3d")
+    axes.set(xlim=(-0.2, 0.2), ylim=(-0.2, 0.2), zlim=(-0.1, 0.2))
+    viz.draw_obstacle(axes, obstacle)
+    (surface,) = axes.collections
+    axes.figure.canvas.draw()
+    corners = np.reshape(surface._faces, (-1, 3)).T
+    # Seen from 10 m in float32: 1e-6 m of 10 m, a few times over.
+    np.testing.assert_allclose(obstacle.distance(*corners)[0], 0.0, atol=1e-5)
+    # It is all around: its extents are those of the obstacle, found by distances from outside.
+    if not isinstance(obstacle, Plane):
+        for axis in range(3):
+            for side, extent in ((1.0, corners[axis].max()), (-1.0, -corners[axis].min())):
+                far = 1e3 * side * np.eye(3)[axis]
+                wanted = 1e3 - float(obstacle.distance(*far)[0])
+                assert extent == pytest.approx(wanted, abs=1.5e-3)  # a grid of 7.5 degrees
+
+
+def test_obstacles_are_cut_off_at_the_limits_of_the_picture():
+    axes = plt.figure().add_subplot(projection="3d")
+    axes.set(xlim=(-0.2, 0.2), ylim=(-0.1, 0.1), zlim=(-0.1, 0.2))
+    viz.draw_obstacle(axes, Table())  # the bottom of the picture
+    assert not axes.collections
+    viz.draw_obstacle(axes, table_with_edge(0.1))
+    axes.figure.canvas.draw()
+    corners = np.reshape(axes.collections[0]._faces, (-1, 3)).T
+    np.testing.assert_allclose(corners.min(axis=1), [-0.2, -0.1, -0.1])
+    np.testing.assert_allclose(corners.max(axis=1), [0.1, 0.1, 0.0], atol=1e-5)
+
+
+def test_executions_are_drawn_with_their_obstacles():
+    body = rope(9)
+    start = goals.flat(body)
+    frames = np.stack([start, start])
+    ball = Sphere((0.0, 0.0, 0.0), 0.1)
+    figure = viz.plot_executions(body, start, {"one": (frames, 0.5)}, "a_task", (ball, Table()))
+    counts = [
+        sum(isinstance(c, Poly3DCollection) for c in axes.collections) for axes in figure.axes
+    ]
+    assert counts == [1, 1, 1]
     figure.canvas.draw()
 
 

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from experiments.physics import against_mujoco, resolution, self_contact, swings, two_sheets
+from experiments.physics import (
+    against_mujoco,
+    obstacles,
+    resolution,
+    self_contact,
+    swings,
+    two_sheets,
+)
 from jaxsimp.cli.status import exit_status
 
 if TYPE_CHECKING:
@@ -19,6 +26,7 @@ FIGURES: "dict[str, Callable[[bool], tuple[Figure, str]]]" = {
     "time_step": swings.plot_time_step,
     "resolution": resolution.plot_resolution,
     "energy": swings.plot_energy,
+    "obstacles": obstacles.plot_obstacles,
     "mujoco": against_mujoco.plot_mujoco,
     "self_contact": self_contact.plot_self_contact,
     "two_sheets": two_sheets.plot_two_sheets,
@@ -28,7 +36,7 @@ FIGURES: "dict[str, Callable[[bool], tuple[Figure, str]]]" = {
 
 @dataclass(frozen=True)
 class Options:
-    """Figures of the physics page: convergence, energy, MuJoCo beside ours, contact, garments."""
+    """Figures of the physics page: convergence, energy, obstacles, MuJoCo, contact, garments."""
 
     out: Path = Path("docs/figures")
     """Folder of the figures, created if missing."""

@@ -46,7 +46,7 @@ def hang_in_mujoco(body: Body, start: Positions, held: Sequence[int], seconds: f
     """
     import mujoco
 
-    model = make_model(body, "full", held, table=False)
+    model = make_model(body, "full", held, obstacles=())
     data = mujoco.MjData(model)
     data.qpos[:] = (start - body.rest).ravel()
     for particle in held:

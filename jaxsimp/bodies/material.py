@@ -34,7 +34,7 @@ class Material:
         damping: force per rate of elongation, newton-seconds per metre. Rope or cloth: damping of
             each spring. Mesh: damping of the sheet, distributed over all springs.
         drag: rate of air drag on every particle, per second: dv/dt = -drag v.
-        friction: Coulomb coefficient between the body and the table.
+        friction: Coulomb coefficient between the body and obstacles.
         thickness: metres; a particle rests on the table at half of it.
 
     Raises:

@@ -1,5 +1,6 @@
 """Pickers: grasp particles and carry them along displacements, within limits."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -7,8 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsimp.dynamics.contact.obstacles import Obstacle, Table
+
 NONE = -1
 """The particle id of a picker that grasps nothing (None in Eq. 1 of the paper)."""
+GRAZE = 1e-5
+"""Depth, metres, to which a path may enter an obstacle: paths along a surface have rounding."""
+TOUCHES = 16
+"""Steps in the search for the first touch of a path; one that needs more ends before it."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["pick", "displacement"], meta_fields=[])
@@ -77,22 +84,25 @@ def speed_profile(steps: int) -> Float[Array, " steps"]:
 def grasp(
     pickers: Pickers,
     rest: Float[Array, "N 3"],
-    floor: Float[Array, ""],
+    obstacles: Sequence[Obstacle],
+    radius: Float[Array, ""],
     position: Float[Array, "N 3"],
     action: Actions,
 ) -> tuple[Bool[Array, " N"], Float[Array, "N 3"]]:
     """Held particles during an action, and their displacements.
 
-    `grasp` clips displacements to the limits and to the table. If several pickers name a particle,
-    the first one holds it. Two pickers violate the stretch rule, C(a) < 0 of Eq. 2, if their
-    particles would end at `max_stretch` times their rest distance or farther; both then hold
-    still, so a third may violate the rule too. (On a straight path the distance of two particles
-    is convex in time, so it is never larger than at both ends.)
+    `grasp` clips displacements to the limits, pushes targets out of obstacles along the normal,
+    and ends straight paths at the limits, or where they first touch an obstacle. If several
+    pickers name a particle, the first one holds it. Two pickers violate the stretch rule,
+    C(a) < 0 of Eq. 2, if their particles would end at `max_stretch` times their rest distance or
+    farther; both then hold still, so a third may violate the rule too. (On a straight path the
+    distance of two particles is convex in time, so it is never larger than at both ends.)
 
     Args:
         pickers: limits of the pickers' motion.
         rest: rest coordinates of the body, metres.
-        floor: lowest height of a particle, metres.
+        obstacles: rigid bodies at rest.
+        radius: least distance of a particle from an obstacle, metres.
         position: positions of the particles, metres.
         action: one action, shapes (G,) and (G, 3).
 
@@ -103,13 +113,78 @@ def grasp(
     holds = _holds(action.pick, len(position))
     start = position[action.pick]
     target = start + jnp.clip(action.displacement, -pickers.limits[None], pickers.limits[None])
-    target = target.at[:, 2].max(floor)
+    target = _outside(obstacles, radius, target)
+    if not all(isinstance(each, Table) for each in obstacles):  # no path is through the table alone
+        target = _cut(pickers, obstacles, radius, start, target)
     for _ in range(max(1, len(holds) - 1)):  # each pass that changes anything stops a picker
         allowed = _allowed(pickers, rest[action.pick], target, holds)
         target = jnp.where(allowed[:, None], target, start)
     moves = target - start
     chosen = holds[:, None] & (action.pick[:, None] == jnp.arange(len(position))[None])
     return chosen.any(axis=0), chosen.T.astype(moves.dtype) @ moves
+
+
+def _outside(
+    obstacles: Sequence[Obstacle], radius: Float[Array, ""], target: Float[Array, "G 3"]
+) -> Float[Array, "G 3"]:
+    """Targets pushed out of obstacles, one after another."""
+    for obstacle in obstacles:
+        distance, normal = obstacle.distance(*target.T)
+        lifted = jnp.maximum(distance, radius)
+        # In this order a height above the table is exactly `lifted`.
+        moved = [
+            jnp.where(distance < radius, (at - part * distance) + part * lifted, at)
+            for at, part in zip(target.T, normal, strict=True)
+        ]
+        target = jnp.stack(moved, axis=1)
+    return target
+
+
+def _cut(
+    pickers: Pickers,
+    obstacles: Sequence[Obstacle],
+    radius: Float[Array, ""],
+    start: Float[Array, "G 3"],
+    target: Float[Array, "G 3"],
+) -> Float[Array, "G 3"]:
+    """Ends of straight paths to targets: at the limits, or where they first touch an obstacle."""
+    way = target - start
+    excess = (jnp.abs(way) / pickers.limits[None]).max(axis=1, keepdims=True)
+    target = start + way / jnp.maximum(excess, 1.0)  # what pushed it out may have been large
+    for obstacle in obstacles:
+        share = _clear_share(obstacle, radius, start, target)[:, None]
+        target = jnp.where(share < 1.0, start + share * (target - start), target)
+    return target
+
+
+def _clear_share(
+    obstacle: Obstacle,
+    radius: Float[Array, ""],
+    start: Float[Array, "G 3"],
+    target: Float[Array, "G 3"],
+) -> Float[Array, " G"]:
+    """Share of straight paths up to their first touch with an obstacle; 1 without a touch.
+
+    Newton's method on the clearance along the path, which is convex as obstacles are: from the
+    start it goes to where the path meets the plane at the nearest point of the surface, which is
+    never beyond the touch, however few the steps. A path that leads away from that plane is clear.
+    """
+    way = target - start
+
+    def ahead(share: Float[Array, " G"]) -> Float[Array, " G"]:
+        place = start + share[:, None] * way
+        distance, normal = obstacle.distance(*place.T)
+        clearance = distance - radius + GRAZE
+        speed = sum(part * along for part, along in zip(normal, way.T, strict=True))
+        enters = speed < -0.1 * GRAZE  # less on the rest of the path is grazing
+        step = clearance / jnp.where(enters, -speed, 1.0)
+        return jnp.where(enters, jnp.clip(share + step, 0.0, 1.0), 1.0)
+
+    def stop(_: Int[Array, ""], share: Float[Array, " G"]) -> Float[Array, " G"]:
+        return jax.lax.stop_gradient(ahead(share))
+
+    # The last step has the derivative of the touch by the path (implicit function theorem).
+    return ahead(jax.lax.fori_loop(0, TOUCHES, stop, jnp.zeros_like(way[:, 0])))
 
 
 def _holds(pick: Int[Array, " G"], count: int) -> Bool[Array, " G"]:

@@ -61,7 +61,8 @@ def rollout_observing(
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
         position = unpack(simulation, moving[0]).position
-        held, displacement = grasp(pickers, simulation.rest, simulation.radius, position, action)
+        around = simulation.rest, simulation.obstacles, simulation.radius
+        held, displacement = grasp(pickers, *around, position, action)
         motion = Motion(held, displacement.T / simulation.time_step)
         moving = run(simulation, moving, motion, speed_profile(pickers.steps))
         return moving, observe(end(simulation, moving), action)

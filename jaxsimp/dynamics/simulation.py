@@ -1,5 +1,6 @@
 """Simulations: the physics of a body as arrays, with a time step proven stable."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -9,10 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp.bodies import Body
+from jaxsimp.dynamics.contact.obstacles import Obstacle, Table, has_table, make_obstacles
 from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_contact
 from jaxsimp.dynamics.springs import Springs, make_springs
 
-PHYSICS = ("mass", "radius", "drag", "friction", "gravity", "time_step")
+PHYSICS = ("mass", "radius", "drag", "friction", "gravity", "time_step", "obstacles")
 """Fields of `Simulation`, besides springs, with a cotangent: velocities depend on them."""
 
 
@@ -52,11 +54,12 @@ class Simulation:
         springs: stiffness, damping and rest lengths.
         rest: rest coordinates, shape (N, 3), metres.
         mass: masses, shape (N,), kilograms.
-        radius: height of a particle on the table, metres.
+        radius: distance of a particle from an obstacle that it rests on, metres.
         drag: air drag, per second.
-        friction: Coulomb coefficient with the table.
+        friction: Coulomb coefficient with the obstacles.
         gravity: downward acceleration, metres per second squared.
         time_step: time step, seconds.
+        obstacles: rigid bodies at rest, in the order in which they act.
         self_contact: contacts of the body with itself; None for a body that passes through itself.
     """
 
@@ -68,7 +71,13 @@ class Simulation:
     friction: Float[Array, "..."]
     gravity: Float[Array, "..."]
     time_step: Float[Array, "..."]
+    obstacles: tuple[Obstacle, ...] = (Table(),)
     self_contact: SelfContact | None = None
+
+    @property
+    def floor(self) -> Float[Array, "..."]:
+        """Lowest height of a particle above the table, metres; minus infinity without a table."""
+        return self.radius if has_table(self.obstacles) else jnp.full_like(self.radius, -jnp.inf)
 
 
 def make_simulation(
@@ -76,6 +85,7 @@ def make_simulation(
     time_step: float = 2e-3,
     gravity: float = 9.81,
     *,
+    obstacles: Sequence[Obstacle] = (Table(),),
     self_contact: bool = False,
     top_speed: float = TOP_SPEED,
 ) -> Simulation:
@@ -85,13 +95,15 @@ def make_simulation(
         body: body to simulate.
         time_step: time step, seconds, at most `largest_time_step(body)`.
         gravity: downward acceleration, metres per second squared.
+        obstacles: rigid bodies at rest, in the order in which they act; the table by default.
         self_contact: whether layers rest on each other and rub, see `make_self_contact`; the
             body passes through itself otherwise.
         top_speed: largest speed of a picker, metres per second; for self-contact only.
 
     Raises:
         ValueError: if the time step is not positive, or is unstable for the body's stiffness,
-            damping, drag and mass; if gravity is not finite; or if the body has no thickness, or
+            damping, drag and mass; if gravity is not finite; if an obstacle is too small for the
+            body's spacing or has a number out of its range; or if the body has no thickness, or
             pickers are too fast, for self-contact.
     """
     largest = largest_time_step(body)
@@ -117,6 +129,7 @@ def make_simulation(
         friction=array(body.material.friction),
         gravity=array(gravity),
         time_step=array(time_step),
+        obstacles=make_obstacles(obstacles, body),
         self_contact=(
             make_self_contact(body, time_step, top_speed=top_speed) if self_contact else None
         ),

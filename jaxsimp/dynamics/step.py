@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsimp.dynamics.contact.table import table_contact
+from jaxsimp.dynamics.contact.rigid import contact
 from jaxsimp.dynamics.simulation import PHYSICS, Simulation, State
 from jaxsimp.dynamics.springs import (
     over_batch,
@@ -57,9 +57,9 @@ def step_and_free(
     position, velocity = packed
     tensions = spring_tensions(simulation.springs, position, velocity)
     forces = pull(simulation.springs, tensions, position)
-    speed, height = _here(simulation, packed)
+    place, speed = _here(simulation, packed)
     free = _free(simulation, motion, forces, speed)
-    moved = _constrained(simulation, motion.held, list(motion.drive), share, free, height)
+    moved = _constrained(simulation, motion.held, list(motion.drive), share, free, place)
     # Write velocities in place, row by row: XLA does not vectorise a stack of rows. Then all
     # positions move, the halo by zero. (Writing positions in place, too, costs a fifth of the
     # step, as the step also reads them.)
@@ -94,16 +94,16 @@ def step_vjp(
     # Only parameters that the velocities depend on: ids have no cotangent.
     physics: dict[str, Any] = {name: getattr(simulation, name) for name in PHYSICS}
 
-    def constrained(physics: dict[str, Any], drive: Axes, free: Axes, height: Array) -> Axes:
+    def constrained(physics: dict[str, Any], drive: Axes, free: Axes, place: Axes) -> Axes:
         changed = dataclasses.replace(simulation, **physics)
-        return _constrained(changed, motion.held, drive, share, free, height)
+        return _constrained(changed, motion.held, drive, share, free, place)
 
     def unconstrained(physics: dict[str, Any], forces: Axes, velocity: Axes) -> Axes:
         return _free(dataclasses.replace(simulation, **physics), motion, forces, velocity)
 
-    speed, height = _here(simulation, packed)
-    moved, pullback = jax.vjp(constrained, physics, list(motion.drive), free, height)
-    physics_bar, drive_bar, free_bar, height_bar = pullback(moved_bar)
+    place, speed = _here(simulation, packed)
+    moved, pullback = jax.vjp(constrained, physics, list(motion.drive), free, place)
+    physics_bar, drive_bar, free_bar, place_bar = pullback(moved_bar)
     # The step is linear in forces: their values matter only to cotangents of the physics.
     forces = pull(springs, tensions, packed[0]) if of_simulation else speed
     _, pullback = jax.vjp(unconstrained, physics, forces, speed)
@@ -111,7 +111,7 @@ def step_vjp(
     # The values in the halo do not matter: the springs into it have no stiffness.
     force_bar = _write_rows(simulation, packed[0], forces_bar)
     by_position, by_velocity = spring_forces_vjp(springs, tensions, *packed, force_bar)
-    by_position[2] += height_bar
+    by_position = [a + b for a, b in zip(by_position, place_bar, strict=True)]
     simulation_bar = None
     if of_simulation:
         physics_bar = jax.tree.map(jnp.add, physics_bar, more_bar)
@@ -147,10 +147,10 @@ def _constrained(
     drive: Axes,
     share: Float[Array, ""],
     free: Axes,
-    height: Float[Array, "N *B"],
+    place: Axes,
 ) -> Axes:
     """Velocities after contact and pickers."""
-    moved = table_contact(simulation, height, free)
+    moved = contact(simulation, place, free)
     return [jnp.where(held, drive[axis] * share, moved[axis]) for axis in range(3)]
 
 
@@ -164,11 +164,11 @@ def _write_rows(
     return array
 
 
-def _here(simulation: Simulation, packed: Packed) -> tuple[Axes, Float[Array, "N *B"]]:
-    """Velocities and heights without halo."""
-    position, velocity = packed
+def _here(simulation: Simulation, packed: Packed) -> tuple[Axes, Axes]:
+    """Positions and velocities without halo."""
     here = slice(simulation.springs.halo, simulation.springs.halo + len(simulation.mass))
-    return [velocity[axis, here] for axis in range(3)], position[2, here]
+    position, velocity = ([array[axis, here] for axis in range(3)] for array in packed)
+    return position, velocity
 
 
 def pack(simulation: Simulation, state: State) -> Packed:

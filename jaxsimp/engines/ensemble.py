@@ -34,7 +34,7 @@ class Spread:
         stiffness: factor on the stiffness of all springs.
         damping: factor on the damping of all springs.
         drag: factor on air drag.
-        friction: factor on friction with the table.
+        friction: factor on friction with obstacles.
         mass: factor on the mass of all particles.
         time_step: factor on the time step. An action takes the same number of time steps in every
             member, so its duration has this factor too: pickers are slower or faster.

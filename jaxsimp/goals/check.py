@@ -36,7 +36,7 @@ def as_goal(body: Body, goal: Positions) -> Positions:
     return goal
 
 
-def check_goal(body: Body, goal: Positions) -> Positions:
+def check_goal(body: Body, goal: Positions, *, has_table: bool = True) -> Positions:
     """The goal as a float array, if the body can reach it.
 
     No particle may be farther under the table than the noise (`NOISE` times the body's size). The
@@ -46,6 +46,11 @@ def check_goal(body: Body, goal: Positions) -> Positions:
     times their distance along the springs, plus the noise. One particle of each pair is among up
     to `MOST_SOURCES` particles spread over the body.
 
+    Args:
+        body: the body.
+        goal: goal positions, metres.
+        has_table: whether there is a table, which no particle may be under.
+
     Raises:
         ValueError: if the shape is not (N, 3), a coordinate is not finite, a particle is under
             the table, or the body is stretched too far.
@@ -53,7 +58,7 @@ def check_goal(body: Body, goal: Positions) -> Positions:
     goal = as_goal(body, goal)
     lowest = int(goal[:, 2].argmin())
     under = -goal[lowest, 2]
-    if under > NOISE * body.size:
+    if has_table and under > NOISE * body.size:
         raise ValueError(
             f"the goal of particle {lowest} is {under:.4g} m under the table, which is at z = 0 "
             f"with z up; raise the goal, or exchange its axes if it has another one up"

@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body, Material
-from jaxsimp.dynamics import Actions
+from jaxsimp.dynamics import Actions, Obstacle
+from jaxsimp.dynamics.contact.obstacles import SHAPES
 from jaxsimp.engines import Execution
 from jaxsimp.records.provenance import environment
 from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, task_names
@@ -57,7 +58,8 @@ class SavedPlan:
         since a file holds no functions.
 
         Raises:
-            ValueError: if the file is of version 0.1, which stores no task.
+            ValueError: if the file is of version 0.1, which stores no task, or the task has an
+                obstacle of a shape that is not the library's.
         """
         if self.body is None or self.episode is None:
             raise ValueError(
@@ -69,6 +71,7 @@ class SavedPlan:
             "limits": tuple(told["limits"]),
             "longest_time_step": told["time_step"],
             "episode_fn": FixedStart(self.episode),
+            "obstacles": _obstacles(told),
         }
         if told["name"] in task_names():
             registered = make_task(told["name"], told["resolution"])
@@ -171,7 +174,27 @@ def _task_text(task: Task) -> dict[str, Any]:
         "resolution": task.resolution,
         **{name: getattr(task, name) for name in SETTINGS},
         "time_step": task.time_step,
+        "obstacles": [
+            {"shape": type(obstacle).__name__}
+            | {name: np.asarray(number).tolist() for name, number in vars(obstacle).items()}
+            for obstacle in task.obstacles
+        ],
     }
+
+
+def _obstacles(told: Mapping[str, Any]) -> tuple[Obstacle, ...]:
+    """The obstacles of a task; the table in a file that is older than obstacles."""
+    return tuple(map(_obstacle, told.get("obstacles", [{"shape": "Table"}])))
+
+
+def _obstacle(told: Mapping[str, Any]) -> Obstacle:
+    shape, numbers = told["shape"], {k: np.asarray(v) for k, v in told.items() if k != "shape"}
+    if shape not in SHAPES:
+        raise ValueError(
+            f"the plan's task has an obstacle of the shape {shape}; files are read with "
+            f"{', '.join(SHAPES)}. Make the task by its own code"
+        )
+    return SHAPES[shape](**numbers)
 
 
 def _is_array(field: dataclasses.Field[Any], body: Body) -> bool:

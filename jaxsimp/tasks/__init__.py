@@ -51,6 +51,9 @@ from jaxsimp.tasks import cloth
 from jaxsimp.tasks import garments
 
 # isort: split
+from jaxsimp.tasks import draping
+
+# isort: split
 from jaxsimp.tasks.costs import MatchingCost, distance_cost, matching_distance
 from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
@@ -73,6 +76,7 @@ __all__ = [
     "cloth",
     "crumple",
     "distance_cost",
+    "draping",
     "garments",
     "make_task",
     "matching_distance",

@@ -10,14 +10,17 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxsimp import goals
 from jaxsimp.bodies import Body
 from jaxsimp.dynamics import (
+    Obstacle,
     Pickers,
     Simulation,
     State,
+    Table,
     at_rest,
     largest_time_step,
     make_pickers,
     make_simulation,
 )
+from jaxsimp.dynamics.contact.obstacles import check_obstacles, has_table
 from jaxsimp.tasks.check import check_costs, check_count, check_draw, check_limits, check_seconds
 from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
 
@@ -40,6 +43,7 @@ class Task:
         settle_actions: time with nothing held, between the last action and the score, in multiples
             of `action_seconds`.
         longest_time_step: upper bound on the time step of the simulation, seconds.
+        obstacles: rigid bodies at rest, in the order in which they act.
         draw_fn: function from a key to an episode, in pure JAX; None if `episode_fn` alone makes
             episodes.
         name: name of the task; for a registered task that of its factory, see `register`.
@@ -47,9 +51,9 @@ class Task:
             registered.
 
     Raises:
-        ValueError: if `goals.check_goal` raises for the goal, a number is out of its range, JAX
-            cannot compile a cost, a cost is not a float scalar, or `draw_fn` does not draw an
-            episode of the body.
+        ValueError: if `goals.check_goal` raises for the goal, a number is out of its range, an
+            obstacle is too small for the body, JAX cannot compile a cost, a cost is not a float
+            scalar, or `draw_fn` does not draw an episode of the body.
     """
 
     body: Body
@@ -63,12 +67,14 @@ class Task:
     action_seconds: float = 0.3
     settle_actions: int = 4
     longest_time_step: float = 2e-3
+    obstacles: tuple[Obstacle, ...] = (Table(),)
     draw_fn: DrawFn | None = None
     name: str = "unnamed"
     resolution: int | None = None
 
     def __post_init__(self) -> None:
-        goals.check_goal(self.body, self.goal)
+        check_obstacles(self.obstacles, self.body)
+        goals.check_goal(self.body, self.goal, has_table=has_table(self.obstacles))
         check_limits(self.limits)
         for name, least in (("num_actions", 1), ("num_pickers", 1), ("settle_actions", 0)):
             check_count(name, getattr(self, name), least)
@@ -105,7 +111,11 @@ class Task:
             ValueError: if the body has no thickness, or pickers are too fast, for self-contact.
         """
         return make_simulation(
-            self.body, self.time_step, self_contact=self_contact, top_speed=self.top_speed
+            self.body,
+            self.time_step,
+            obstacles=self.obstacles,
+            self_contact=self_contact,
+            top_speed=self.top_speed,
         )
 
     @property

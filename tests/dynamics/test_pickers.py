@@ -14,6 +14,7 @@ from jaxsimp.bodies import cloth, rope
 from jaxsimp.dynamics import (
     NONE,
     Actions,
+    Table,
     at_rest,
     make_pickers,
     make_simulation,
@@ -70,6 +71,7 @@ def test_grasp_agrees_with_the_rules_in_loops(num_pickers):
         found = jit_grasp(
             make_pickers(limits),
             jnp.asarray(rest),
+            (Table(),),
             jnp.asarray(floor),
             jnp.asarray(position),
             Actions(jnp.asarray(picks), jnp.asarray(displacements)),
@@ -185,6 +187,7 @@ def test_stretch_rule_refuses_equality():
     _, displacement = jit_grasp(
         make_pickers(WIDE, max_stretch=1.5),
         jnp.array([[0.0, 0, 0], [0.5, 0, 0]]),
+        (),
         jnp.asarray(0.0),
         jnp.array([[0.0, 0, 0], [0.5, 0, 0]]),
         Actions(jnp.array([0, 1]), jnp.array([[0.0, 0, 0], [0.25, 0, 0]])),
@@ -212,7 +215,7 @@ def test_a_third_picker_is_refused_when_it_would_leave_one_that_is():
     # distance from where 1 was going, and is too far from where 1 remains.
     rest = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
     moves = np.array([[-0.005, 0, 0], [0.05, 0, 0], [0.03, 0, 0]])
-    args = jnp.asarray(rest), jnp.asarray(0.0), jnp.asarray(rest)
+    args = jnp.asarray(rest), (), jnp.asarray(0.0), jnp.asarray(rest)
     pick = jnp.arange(3)
     held, displacement = jit_grasp(make_pickers(WIDE), *args, Actions(pick, jnp.asarray(moves)))
     assert held.all()

@@ -11,6 +11,8 @@ import pytest
 from jaxsimp.dynamics import (
     NONE,
     Actions,
+    Capsule,
+    Table,
     at_rest,
     largest_time_step,
     make_pickers,
@@ -208,6 +210,16 @@ def test_a_plan_is_executed_in_the_first_member():
 
 
 # --- members -------------------------------------------------------------------------------------
+
+
+def test_every_member_has_the_obstacles_of_the_task():
+    bar = Capsule((0.0, -0.2, 0.1), (0.0, 0.2, 0.1), 0.08)
+    task = dataclasses.replace(small_task(), obstacles=(bar, Table()))
+    members = make_ensemble(task, 3).simulations
+    found, table = members.obstacles
+    np.testing.assert_array_equal(found.radius, np.float32([0.08] * 3))
+    np.testing.assert_array_equal(found.end, np.float32([bar.end] * 3))
+    assert isinstance(table, Table)
 
 
 def test_the_first_member_is_the_body_itself():

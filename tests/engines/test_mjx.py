@@ -15,7 +15,9 @@ from jaxsimp.bodies import Body, cloth, garments, rope
 from jaxsimp.dynamics import (
     NONE,
     Actions,
+    Sphere,
     State,
+    Table,
     at_rest,
     largest_time_step,
     make_pickers,
@@ -149,6 +151,30 @@ def test_a_rollout_on_the_table_is_ours():
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         # Rounding of float64, which impacts and 320 steps let grow.
         np.testing.assert_allclose(a, b, atol=1e-9)
+
+
+@pytest.mark.slow  # MJX compiles for long
+@pytest.mark.usefixtures("x64")
+def test_a_rollout_on_an_obstacle_is_ours():
+    body, step = rope(7, 0.15), 1e-3
+    ball = Sphere((0.0, 0.0, 0.0), 0.05)
+    task = dataclasses.replace(
+        make_task("rope_folding", 7),
+        body=body,
+        goal=body.rest,
+        obstacles=(ball, Table()),
+        longest_time_step=step,
+    )
+    theirs, pickers = MJX().physics(task)
+    start = at_rest(body.rest + np.array([0.002, 0.001, 0.06]))
+    # Down beside the ball, and into it, where the path ends.
+    actions = actions_of([[0, NONE], [3, NONE]], [[[0.0, 0.0, -0.03]] * 2, [[0.0, 0.0, -0.1]] * 2])
+    found, frames = jax.jit(mjx_rollout)(theirs, pickers, start, actions)
+    expected, wanted = jax.jit(rollout)(theirs.ours, pickers, start, actions)
+    lying = np.asarray(ball.distance(*expected.position.T)[0]) - body.radius
+    assert (np.abs(lying) < 1e-4).any()
+    np.testing.assert_allclose(found.position, expected.position, atol=1e-9)  # as above
+    np.testing.assert_allclose(frames, wanted, atol=1e-9)
 
 
 @pytest.mark.slow  # MJX compiles for long

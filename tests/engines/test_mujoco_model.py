@@ -59,7 +59,7 @@ def test_every_particle_has_its_mass_and_place(body, variant):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_body_falls_as_the_closed_form_with_drag(body, variant):
     body = body.scaled(drag=4.0 / body.material.drag)
-    model = make_model(body, variant, table=False)
+    model = make_model(body, variant, obstacles=())
     data = mujoco.MjData(model)
     step(model, data, 0.2)
     t, drag = data.time, body.material.drag
@@ -155,7 +155,7 @@ def test_a_sheet_of_springs_bends_as_the_plate_in_the_mean_over_directions():
 
 def test_a_hanging_rope_stretches_as_the_closed_form():
     body = rope(9, 0.2, drag=20.0)  # much drag, for it to come to rest soon
-    model = make_model(body, "full", [0], table=False)
+    model = make_model(body, "full", [0], obstacles=())
     data = mujoco.MjData(model)
     order = np.arange(9)
     hung = np.zeros((9, 3))
@@ -197,7 +197,7 @@ def test_a_hanging_sheet_stretches_as_the_closed_form():
         (9, 9), (0.2, 0.2), mass=0.005, stretch_stiffness=8.0, shear_stiffness=4.0, drag=30.0
     )
     top = np.arange(9)
-    model = make_model(body, "full", top.tolist(), table=False)
+    model = make_model(body, "full", top.tolist(), obstacles=())
     data = mujoco.MjData(model)
     hung = np.stack([body.rest[:, 1], np.zeros(81), -body.rest[:, 0] - 0.1], axis=1)
     data.qpos[:] = (hung - body.rest).ravel()
@@ -216,7 +216,7 @@ def test_a_hanging_sheet_stretches_as_the_closed_form():
 @pytest.mark.parametrize("ratio", [1.01, 1.5, 2.0])
 def test_a_stretched_sheet_pulls_as_saint_venants_and_kirchhoffs_material(ratio):
     body = cloth((5, 5))
-    model = make_model(body, "full", table=False)
+    model = make_model(body, "full", obstacles=())
     data = mujoco.MjData(model)
     data.qpos[:] = (body.rest * [ratio - 1, 0, 0]).ravel()
     mujoco.mj_forward(model, data)
@@ -229,7 +229,7 @@ def test_a_stretched_sheet_pulls_as_saint_venants_and_kirchhoffs_material(ratio)
 def test_the_fast_variant_hardly_stretches():
     # A rope whose springs would be stretched by half by its own weight.
     body = rope(9, 0.2, stretch_stiffness=10.0, bend_stiffness=0.0, drag=20.0)
-    model = make_model(body, "fast", [0], table=False)
+    model = make_model(body, "fast", [0], obstacles=())
     data = mujoco.MjData(model)
     hold(model, data, body, [0])
     step(model, data, 1.0)

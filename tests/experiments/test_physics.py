@@ -59,6 +59,13 @@ def check_energy(figure):
     assert np.abs(undamped[-1]).max() < 0.1 * np.abs(damped[-1])
 
 
+def check_obstacles(figure):
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles[:4] == ["start", "action 1", "action 2", "action 3"]
+    assert titles[4].startswith("settled, score 0.9")
+    assert all(len(axes.collections) == 3 for axes in figure.axes)  # towel, its rim, and the bar
+
+
 def check_mujoco(figure):
     *hanging, fold = figure.axes
     ways = against_mujoco.ways_to_hang(cloth((5, 5)))

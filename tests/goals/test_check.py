@@ -130,6 +130,13 @@ def test_a_particle_under_the_table_is_named(depth, particle):
         goals.check_goal(CLOTH, goal)
 
 
+def test_without_a_table_a_goal_may_be_anywhere_below():
+    goal = goals.flat(CLOTH) - np.array([0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(goals.check_goal(CLOTH, goal, has_table=False), goal)
+    with pytest.raises(ValueError, match="under the table"):
+        goals.check_goal(CLOTH, goal)
+
+
 def test_a_goal_that_dips_into_the_table_with_its_noise_is_let_in():
     goal = goals.flat(CLOTH)
     goal[3, 2] = -0.99 * NOISE * 0.3

@@ -14,7 +14,7 @@ import pytest
 
 from jaxsimp import goals
 from jaxsimp.bodies import t_shirt
-from jaxsimp.dynamics import Actions
+from jaxsimp.dynamics import Actions, Box, Capsule, Sphere, Table
 from jaxsimp.engines import Execution, ExecutionStatus, MassSprings
 from jaxsimp.records import SavedPlan, load_plan, save_plan
 from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, score
@@ -69,6 +69,35 @@ def test_a_file_holds_what_was_written(tmp_path):
     assert found.about["found"] == {"seed": 3}
     assert found.about["environment"]["versions"]["jaxsimp"]
     assert found.about["task"]["name"] == "rope_folding"
+
+
+def test_a_file_keeps_the_obstacles(tmp_path):
+    kept = (Capsule((0.0, 0, 1), (0.0, 1, 1), 0.2), Box((0.0, 0, 0), (0.3, 0.3, 0.3)), Table())
+    body = rope_task().body
+    for task in (
+        dataclasses.replace(rope_task(), obstacles=kept),
+        dataclasses.replace(rope_task(), obstacles=kept, name="mine", resolution=None),
+    ):
+        path = tmp_path / "plan.npz"
+        save_plan(path, task, task.episode_fn(0), PLAN, executed(), engine=MassSprings())
+        found = load_plan(path).task()
+        for one, other in zip(found.obstacles, kept, strict=True):
+            assert type(one) is type(other)
+            for name, number in vars(other).items():
+                np.testing.assert_array_equal(getattr(one, name), number)
+        assert len(found.simulation().obstacles) == 3
+        assert found.body.num_particles == body.num_particles
+
+
+def test_an_obstacle_of_another_shape_is_not_read(tmp_path):
+    class Ball(Sphere):
+        pass
+
+    task = dataclasses.replace(rope_task(), obstacles=(Ball((0.0, 0.0, 0.0), 0.1),))
+    path = tmp_path / "plan.npz"
+    save_plan(path, task, task.episode_fn(0), PLAN, executed(), engine=MassSprings())
+    with pytest.raises(ValueError, match=r"obstacle of the shape Ball; files are read with Table"):
+        load_plan(path).task()
 
 
 def assert_same_body(found: SavedPlan, body) -> None:

@@ -16,8 +16,10 @@ def test_the_four_tasks_of_the_paper_are_registered():
 
 
 def test_groups_are_all_tasks():
-    assert set(task_names()) == {*task_names("paper"), *task_names("goals")}
+    groups = ("paper", "goals", "obstacles")
+    assert set(task_names()) == {name for group in groups for name in task_names(group)}
     assert len(task_names("goals")) == 8
+    assert task_names("obstacles") == ("towel_over_bar",)
     assert task_names("none") == ()
 
 

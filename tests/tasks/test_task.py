@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsimp.dynamics import NONE, Actions, at_rest
+from jaxsimp.dynamics import NONE, Actions, Sphere, Table, at_rest, table_with_edge
 from jaxsimp.tasks import Episode, Task, make_task, task_names
 
 # --- pickling -------------------------------------------------------------------------------------
@@ -224,3 +224,29 @@ def test_what_draws_no_episode_by_a_key_is_refused(draw_fn, said):
 def test_costs_are_traced_and_nothing_is_computed():
     # What is computed needs a device, and a process that has one cannot choose its number any more.
     subprocess.run([sys.executable, "-c", NO_DEVICE], check=True, cwd=Path(__file__).parents[2])
+
+
+# --- obstacles -----------------------------------------------------------------------------------
+
+
+def test_a_task_refuses_an_obstacle_that_is_too_small_for_its_body():
+    task = make_task("rope_folding", 9)
+    with pytest.raises(ValueError, match=r"Sphere: radius is 0.001 m; .* of this rope leave gaps"):
+        dataclasses.replace(task, obstacles=(Sphere((0.0, 0.0, 0.0), 0.001),))
+
+
+def test_the_simulation_of_a_task_has_its_obstacles():
+    task = make_task("rope_folding", 9)
+    assert task.simulation().obstacles == (Table(),)
+    ball = Sphere((0.1, 0.2, 0.3), 0.5)
+    (found,) = dataclasses.replace(task, obstacles=(ball,)).simulation().obstacles
+    np.testing.assert_array_equal(found.center, np.float32(ball.center))
+    assert float(found.radius) == 0.5
+
+
+def test_a_goal_below_the_edge_of_a_table_is_a_goal():
+    task = make_task("rope_folding", 9)
+    below = np.asarray(task.goal) - np.array([0.0, 0.0, 0.3])
+    dataclasses.replace(task, goal=below, obstacles=(table_with_edge(-1.0),))
+    with pytest.raises(ValueError, match="under the table"):
+        dataclasses.replace(task, goal=below)

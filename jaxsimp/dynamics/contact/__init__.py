@@ -1,1 +1,1 @@
-"""Contact: with the table, and of a body with itself."""
+"""Contact: with obstacles, and of a body with itself."""

@@ -37,7 +37,7 @@ def advance(
     *,
     use_kernel: bool = True,
 ) -> Moving:
-    """One time step: springs, table and pickers, then self-contact; see `touch`."""
+    """One time step: springs, obstacles and pickers, then self-contact; see `touch`."""
     packed, contacts = moving
     plain = replace(simulation, self_contact=None)
     packed, _ = step_and_free(plain, packed, motion, share)
@@ -101,6 +101,9 @@ def touch_step_vjp(
 
 
 def _around(simulation: Simulation, motion: Motion) -> tuple[Array, Array, Array]:
-    """Inverse masses, zero for particles that are held, the floor, and the time step."""
+    """Inverse masses, zero for particles that are held, the floor, and the time step.
+
+    Layers pushed into an obstacle other than the table are pushed out by it in the next step.
+    """
     inverse_mass = jnp.where(motion.held, 0.0, 1.0 / simulation.mass)
-    return inverse_mass, simulation.radius, simulation.time_step
+    return inverse_mass, simulation.floor, simulation.time_step

@@ -88,7 +88,7 @@ def _compare(
 
 
 def _accelerations(simulation: Simulation, state: State) -> Float[Array, "N 3"]:
-    """Our accelerations, without table and pickers."""
+    """Our accelerations, without obstacles and pickers."""
     position, velocity = pack(simulation, state)
     tensions = spring_tensions(simulation.springs, position, velocity)
     forces = jnp.stack(pull(simulation.springs, tensions, position), axis=1)

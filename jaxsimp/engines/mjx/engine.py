@@ -1,7 +1,7 @@
 """MJX, MuJoCo in JAX, as a reference for our dynamics and as an engine of the planner.
 
 `tendon_spec` gives the model of a body. MJX computes accelerations and takes the Euler steps; to
-carry out plans, our table and our pickers correct the velocities of each step, as in our own
+carry out plans, our obstacles and our pickers correct the velocities of each step, as in our own
 dynamics: MJX has contacts of its own, but each costs rows of a constraint solver, and their
 friction is not Coulomb's. So MJX checks springs, gravity, drag and integration, but not contact.
 Gradients are not supported.
@@ -9,6 +9,7 @@ Gradients are not supported.
 
 import contextlib
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -18,8 +19,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxsimp.bodies import Body
-from jaxsimp.dynamics import Actions, Pickers, Simulation, State, make_simulation
-from jaxsimp.dynamics.contact.table import table_contact
+from jaxsimp.dynamics import (
+    Actions,
+    Obstacle,
+    Pickers,
+    Simulation,
+    State,
+    Table,
+    make_simulation,
+)
+from jaxsimp.dynamics.contact.rigid import contact
 from jaxsimp.dynamics.pickers import grasp, speed_profile
 from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.mjx.tendons import tendon_spec
@@ -40,12 +49,12 @@ for a 9 x 9 cloth."""
 )
 @dataclass(frozen=True)
 class MJXSimulation:
-    """A body's physics in MJX, and in our dynamics for the table and the pickers.
+    """A body's physics in MJX, and in our dynamics for obstacles and pickers.
 
     Attributes:
         model: a `mujoco.mjx.Model`.
         data: a `mujoco.mjx.Data` that receives states.
-        ours: the body's simulation in our dynamics, for our table and pickers.
+        ours: the body's simulation in our dynamics, for our obstacles and pickers.
     """
 
     model: Any
@@ -59,7 +68,11 @@ class MJXSimulation:
 
 
 def make_mjx_simulation(
-    body: Body, time_step: float = 2e-3, gravity: float = 9.81
+    body: Body,
+    time_step: float = 2e-3,
+    gravity: float = 9.81,
+    *,
+    obstacles: Sequence[Obstacle] = (Table(),),
 ) -> MJXSimulation:
     """The simulation of a body in MJX.
 
@@ -67,6 +80,7 @@ def make_mjx_simulation(
         body: body to simulate.
         time_step: time step, seconds, at most `jaxsimp.dynamics.largest_time_step(body)`.
         gravity: downward acceleration, metres per second squared.
+        obstacles: rigid bodies at rest, in the order in which they act; our contact.
 
     Raises:
         ValueError: if the body has more than `MOST_PARTICLES` particles, or
@@ -78,7 +92,7 @@ def make_mjx_simulation(
             f"{MOST_PARTICLES}, as its steps are slow. Take fewer particles, or our own "
             f"dynamics"
         )
-    ours = make_simulation(body, time_step, gravity)
+    ours = make_simulation(body, time_step, gravity, obstacles=obstacles)
     model = to_mjx(tendon_spec(body, time_step, gravity).compile())
     return MJXSimulation(model, _mjx().make_data(model, impl="jax"), ours)
 
@@ -98,7 +112,7 @@ def to_mjx(model: Any) -> Any:
 
 
 def mjx_accelerations(simulation: MJXSimulation, state: State) -> Float[Array, "N 3"]:
-    """Accelerations without table and pickers, metres per second squared."""
+    """Accelerations without obstacles and pickers, metres per second squared."""
     data = _mjx().forward(simulation.model, _loaded(simulation, state))
     return data.qacc.reshape(state.position.shape)
 
@@ -106,7 +120,7 @@ def mjx_accelerations(simulation: MJXSimulation, state: State) -> Float[Array, "
 def mjx_trajectory(
     simulation: MJXSimulation, state: State, num_steps: int
 ) -> tuple[State, Float[Array, "T N 3"]]:
-    """Motion by MJX alone, without table and pickers.
+    """Motion by MJX alone, without obstacles and pickers.
 
     Returns:
         States after each of `num_steps` steps, and the accelerations in those steps, stacked along
@@ -131,7 +145,8 @@ def mjx_rollout(
 
     def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:
         ours = simulation.ours
-        held, displacement = grasp(pickers, ours.rest, ours.radius, state.position, action)
+        around = ours.rest, ours.obstacles, ours.radius
+        held, displacement = grasp(pickers, *around, state.position, action)
         drive = displacement / simulation.time_step
 
         def one(state: State, share: Float[Array, ""]) -> tuple[State, None]:
@@ -151,7 +166,7 @@ def _step(
 ) -> State:
     """A step of MJX, with velocities after contact; held particles have the velocity `carried`."""
     free = _free_step(simulation, state)[0].velocity
-    touched = table_contact(simulation.ours, state.position[:, 2], list(free.T))
+    touched = contact(simulation.ours, list(state.position.T), list(free.T))
     velocity = jnp.where(held[:, None], carried, jnp.stack(touched, axis=1))
     return State(state.position + simulation.time_step * velocity, velocity)
 
@@ -193,7 +208,8 @@ class MJX:
         Raises:
             ValueError: if the body has too many particles.
         """
-        return make_mjx_simulation(task.body, task.time_step), task.pickers()
+        simulation = make_mjx_simulation(task.body, task.time_step, obstacles=task.obstacles)
+        return simulation, task.pickers()
 
     def rollout(
         self,

@@ -8,7 +8,7 @@ AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def tendon_spec(body: Body, time_step: float = 2e-3, gravity: float = 9.81) -> Any:
-    """The equations of `jaxsimp.dynamics` as a `mujoco.MjSpec`, without table and pickers.
+    """The equations of `jaxsimp.dynamics` as a `mujoco.MjSpec`, without obstacles and pickers.
 
     - A particle is a body on three slide joints along x, y and z, whose coordinates are its
       position in the world: `qpos` is the (N, 3) positions, row by row, and `qvel` velocities.

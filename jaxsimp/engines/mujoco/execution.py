@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsimp.dynamics import NONE, Actions, Pickers, make_pickers
+from jaxsimp.dynamics import NONE, Actions, Pickers, Simulation, make_pickers
 from jaxsimp.dynamics.pickers import grasp, speed_profile
 from jaxsimp.engines.engine import Execution, ExecutionStatus, Executor
 from jaxsimp.engines.mujoco.model import Variant, as_variant, make_model
@@ -90,8 +90,8 @@ def replay(
             f"{len(episodes)} episodes are given for {len(plans)} plans; give one for each"
         )
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
-    model = make_model(task.body, variant, picked)
-    one = partial(_replay_one, task, model, jax.jit(partial(score, task)))
+    model = make_model(task.body, variant, picked, obstacles=task.obstacles)
+    one = partial(_replay_one, task, task.simulation(), model, jax.jit(partial(score, task)))
     return _side_by_side(one, episodes, plans, num_workers or num_cores())
 
 
@@ -107,13 +107,14 @@ def _side_by_side(
 
 def _replay_one(
     task: Task,
+    simulation: Simulation,
     model: Any,
     score_fn: Callable[[Episode, Float[Array, "N 3"]], Float[Array, ""]],
     episode: Episode,
     plan: Actions,
 ) -> Execution:
     """Carry out one plan."""
-    scene = _Scene(task, model, np.asarray(episode.start, dtype=float))
+    scene = _Scene(task, simulation, model, np.asarray(episode.start, dtype=float))
     frames = [scene.positions()]
     for pick, displacement in zip(
         np.asarray(plan.pick), np.asarray(plan.displacement), strict=True
@@ -131,10 +132,13 @@ def _replay_one(
 class _Scene:
     """One simulation and the actions of pickers in it."""
 
-    def __init__(self, task: Task, model: Any, start: Float[np.ndarray, "N 3"]) -> None:
+    def __init__(
+        self, task: Task, simulation: Simulation, model: Any, start: Float[np.ndarray, "N 3"]
+    ) -> None:
         import mujoco
 
-        self._task, self._model, self._data = task, model, mujoco.MjData(model)
+        self._task, self._simulation = task, simulation  # of which the pickers' rules count
+        self._model, self._data = model, mujoco.MjData(model)
         self._data.qpos[:] = (start - task.body.rest).ravel()
         self._steps = max(1, round(task.action_seconds / model.opt.timestep))
         self._pickers = make_pickers(task.limits, steps=self._steps)
@@ -152,7 +156,7 @@ class _Scene:
     def act(self, pick: np.ndarray, displacement: np.ndarray) -> None:
         """Carry out one action."""
         start = self.positions()
-        held, moves = _grasp(self._task, self._pickers, start, pick, displacement)
+        held, moves = _grasp(self._simulation, self._pickers, start, pick, displacement)
         hold = [(self._picker(i), start[i], moves[i]) for i in np.flatnonzero(held).tolist()]
         for (constraint, _), _, _ in hold:
             self._data.eq_active[constraint] = 1
@@ -205,21 +209,17 @@ def _unstable_kinds() -> tuple[int, ...]:
 
 
 def _grasp(
-    task: Task, pickers: Pickers, position: np.ndarray, pick: np.ndarray, displacement: np.ndarray
+    simulation: Simulation,
+    pickers: Pickers,
+    position: np.ndarray,
+    pick: np.ndarray,
+    displacement: np.ndarray,
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
     """Held particles of an action, and the displacement of each."""
     action = Actions(jnp.asarray(pick), jnp.asarray(displacement, dtype=float))
-    rest, floor = jnp.asarray(task.body.rest, float), jnp.asarray(task.body.radius, float)
-    held, moves = _jitted_grasp(pickers, rest, floor, jnp.asarray(position, float), action)
+    around = simulation.rest, simulation.obstacles, simulation.radius
+    held, moves = _jitted_grasp(pickers, *around, jnp.asarray(position, float), action)
     return np.asarray(held), np.asarray(moves, dtype=float)
 
 
-@jax.jit
-def _jitted_grasp(
-    pickers: Pickers,
-    rest: Float[Array, "N 3"],
-    floor: Float[Array, ""],
-    position: Float[Array, "N 3"],
-    action: Actions,
-) -> tuple[Bool[Array, " N"], Float[Array, "N 3"]]:
-    return grasp(pickers, rest, floor, position, action)
+_jitted_grasp = jax.jit(grasp)

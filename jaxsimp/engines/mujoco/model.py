@@ -4,6 +4,7 @@ A particle becomes a body on three slide joints, so `qpos = position - rest` loa
 states. The correspondence:
 
 - **mass, air drag, friction, radius**: the same numbers. Drag is that of the air on small cubes.
+- **obstacles**: the same surfaces, as geoms; see geoms.py.
 - **stretch**: a sheet of springs is, averaged over directions, an elastic membrane; a rope of
   springs is one spring along each segment (see `stretch_stiffness`). The same holds for damping.
 - **bending**: the energy of our bend springs grows with the fourth power of the angle, that of a
@@ -15,7 +16,7 @@ edges are soft constraints), has no bending stiffness, and passes through itself
 imported when called.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,9 @@ from jaxtyping import Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import face_areas
 from jaxsimp.bodies.topology import are_among, chain, half_edges
-from jaxsimp.dynamics import largest_time_step
+from jaxsimp.dynamics import Obstacle, Table, largest_time_step
+from jaxsimp.dynamics.contact.obstacles import make_obstacles
+from jaxsimp.engines.mujoco.geoms import obstacle_geoms
 
 POISSON = 1 / 3
 """Poisson's ratio of every isotropic sheet of springs, as their forces are central."""
@@ -112,7 +115,7 @@ def make_model(
     variant: str | Variant = "full",
     graspable: Iterable[int] = (),
     *,
-    table: bool = True,
+    obstacles: Sequence[Obstacle] = (Table(),),
 ) -> Any:
     """A body as a compiled `mujoco.MjModel`.
 
@@ -121,12 +124,13 @@ def make_model(
         variant: name of a variant, or a `Variant`.
         graspable: ids of particles that pickers can grasp: each has a mocap body
             `picker_<particle>` and an inactive `connect` constraint of that name.
-        table: whether the model has a table.
+        obstacles: rigid bodies at rest; a rounded box becomes boxes and capsules.
 
     Raises:
-        ValueError: if the variant or a particle does not exist.
+        ValueError: if the variant or a particle does not exist, or an obstacle is refused, see
+            `jaxsimp.dynamics.make_simulation`.
     """
-    return _spec(body, as_variant(variant), graspable, table).compile()
+    return _spec(body, as_variant(variant), graspable, obstacles).compile()
 
 
 def save_mjcf(
@@ -135,6 +139,8 @@ def save_mjcf(
     variant: str | Variant = "full",
     graspable: Iterable[int] = (),
     position: Float[np.ndarray, "N 3"] | None = None,
+    *,
+    obstacles: Sequence[Obstacle] = (Table(),),
 ) -> None:
     """Write a body as MJCF: `python -m mujoco.viewer --mjcf=PATH` opens it.
 
@@ -144,18 +150,21 @@ def save_mjcf(
         variant: as for `make_model`.
         graspable: as for `make_model`.
         position: positions in a keyframe named "start", shape (N, 3), metres.
+        obstacles: as for `make_model`.
 
     Raises:
         ValueError: as for `make_model`.
     """
-    spec = _spec(body, as_variant(variant), graspable, True)
+    spec = _spec(body, as_variant(variant), graspable, obstacles)
     if position is not None:
         spec.add_key(name="start", qpos=(position - body.rest).ravel().tolist())
     spec.compile()
     Path(path).write_text(spec.to_xml())
 
 
-def _spec(body: Body, variant: Variant, graspable: Iterable[int], table: bool) -> Any:
+def _spec(
+    body: Body, variant: Variant, graspable: Iterable[int], obstacles: Sequence[Obstacle]
+) -> Any:
     """The uncompiled model of a body."""
     import mujoco
 
@@ -181,15 +190,10 @@ def _spec(body: Body, variant: Variant, graspable: Iterable[int], table: bool) -
         # MuJoCo's default impedance: a stiffer one does not converge with many edges.
         solref = _stiffest(spec.option.timestep)
         spec.add_equality(type=mujoco.mjtEq.mjEQ_FLEX, name1="body", solref=solref)
-    if table:
-        spec.worldbody.add_geom(
-            name="table",
-            type=mujoco.mjtGeom.mjGEOM_PLANE,
-            size=[2.0, 2.0, 0.1],
-            pos=[0.0, 0.0, body.radius - radius],
-            rgba=[0.9, 0.9, 0.88, 1.0],
-            **contact,
-        )
+    # Particles of a thinner body in MuJoCo rest where ours do: obstacles are grown instead.
+    geoms = obstacle_geoms(make_obstacles(obstacles, body), body.radius - radius)
+    for name, geom in geoms.items():
+        spec.worldbody.add_geom(name=name, rgba=[0.9, 0.9, 0.88, 1.0], **geom, **contact)
     spec.worldbody.add_light(pos=[0.0, 0.0, 2.0])
     for particle in sorted(set(map(int, graspable))):
         _add_picker(spec, body, particle)
