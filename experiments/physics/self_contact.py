@@ -57,7 +57,7 @@ def folded_twice(
         picks = np.full((8, 2), NONE)
         picks[:4, 0] = picked
         actions = Actions(jnp.asarray(picks), jnp.asarray(moves, dtype=float))
-        state, _ = run(simulation, pickers, state, actions, adjoint=False)
+        state, _ = run(simulation, pickers, state, actions)
     return np.asarray(state.position, dtype=float), int(state.missed)
 
 

@@ -28,7 +28,7 @@ DETOUR = 1.1
 """Ratio of the distance along springs to that along the body, at most: 1.08 on a square grid."""
 FEW = 16
 """Particles that are due are looked up alone if they are at most one in so many, else all are."""
-SLACK = 0.4
+SLACK = 0.25
 """Distance that a particle in contact may move until the next lookup, in radii of its disc."""
 AHEAD = 1
 """Look-ahead, in time steps: with more, lookups list more pairs, and their lists last longer."""

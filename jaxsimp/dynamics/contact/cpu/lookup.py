@@ -53,9 +53,8 @@ def look_up(
     num_due = _find_due(position, found_at, allowance, due, is_due)
     if num_due == 0:
         return
-    across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
     if num_due * FEW > count:
-        _find_all(
+        across, known = _find_all(
             position,
             nearest,
             distance,
@@ -66,13 +65,11 @@ def look_up(
             frame,
             adjacent,
             is_sheet,
-            across,
-            known,
         )
         is_due[:] = True
         changed = True
     else:
-        changed = _find_some(
+        changed, across, known = _find_some(
             due[:num_due],
             is_due,
             position,
@@ -85,8 +82,6 @@ def look_up(
             frame,
             adjacent,
             is_sheet,
-            across,
-            known,
         )
     if changed:
         _list_pairs(nearest, partner, listed_by, renewed)
@@ -198,10 +193,8 @@ def _find_all(
     frame,
     adjacent,
     is_sheet,
-    across,
-    known,
 ):
-    """Compare all with all that are near, by cells; each pair once."""
+    """Compare all with all that are near, by cells; each pair once. Returns normals, if known."""
     real = position[0].dtype.type
     count, half = len(position[0]), real(0.5)
     slack, squash, touching, reach = sizes[1], sizes[2], sizes[3], sizes[4]
@@ -209,14 +202,17 @@ def _find_all(
     order, place_of, start, rows, columns = _sorted_into_cells(position, search)
     search = search * search
     clear = np.full(count, search, real)
+    # Of their own: LLVM makes loops of half the speed, or less, of arrays that are handed in.
+    across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
+    least, best = np.empty((2, count), real), np.empty((2, count), np.uint32)
     farthest = real(0)
     points = np.full((3, count + LANES), real(np.nan))  # After the last: near to nothing.
     marks = np.zeros(count + LANES, np.uint32)
     for place in range(count):
         i = order[place]
-        nearest[0, i] = nearest[1, i] = i
-        distance[0, i] = distance[1, i] = reach[i] * reach[i]
-        farthest = max(farthest, distance[0, i])
+        best[0, i] = best[1, i] = i
+        least[0, i] = least[1, i] = reach[i] * reach[i]
+        farthest = max(farthest, least[0, i])
         for axis in range(3):
             points[axis, place] = position[axis][i]
     # Each pair is met in the row of one that comes later, or in the next row.
@@ -249,19 +245,23 @@ def _find_all(
                             clear[i], clear[j] = min(clear[i], squared), min(clear[j], squared)
                             if squared >= farthest:
                                 continue
-                            _find_across(i, position, frame, is_sheet, across, known)
-                            _find_across(j, position, frame, is_sheet, across, known)
+                            for each in (i, j):
+                                if not known[each]:
+                                    known[each] = True
+                                    across[each] = _across(each, position, frame, is_sheet)
                             above = _height(i, x, y, z, is_sheet, across)
-                            _compare(i, j, above, squared, level, squash, nearest, distance)
+                            _compare(i, j, above, squared, level, squash, least, best)
                             above = -_height(j, x, y, z, is_sheet, across)
-                            _compare(j, i, above, squared, level, squash, nearest, distance)
-    above, below = distance[0], distance[1]
+                            _compare(j, i, above, squared, level, squash, least, best)
+    nearest[:], distance[:] = best, least
+    above, below = least[0], least[1]
     for place in range(count):
         i = np.uintp(place)
         free = _free(min(above[i], below[i]), clear[i], touching[i], squash[i])
         allowance[i] = max(slack[i], half * free)
     for axis in range(3):
         found_at[axis] = position[axis]
+    return across, known
 
 
 @compiled
@@ -279,12 +279,10 @@ def _find_some(
     frame,
     adjacent,
     is_sheet,
-    across,
-    known,
 ):
     """Compare those that are due with all, and then those whose nearest has gone away.
 
-    Returns whether any particle has another nearest. Marks as due what was compared.
+    Marks as due what was compared. Returns whether any has another nearest, and known normals.
     """
     real, count = position[0].dtype.type, len(allowance)
     slack, squash, touching, reach = sizes[1], sizes[2], sizes[3], sizes[4]
@@ -292,15 +290,18 @@ def _find_some(
     points = np.full((3, count + LANES), real(np.nan))  # After the last: near to nothing.
     for axis in range(3):
         points[axis, :count] = position[axis]
+    across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
+    least, best = distance.copy(), np.empty((2, count), np.uint32)
     marks = np.zeros(count + LANES, np.uint32)
     ids, squares = np.empty(count, np.uint32), np.empty(count, real)
     # To the nearest that is due: squared distances, and as the search measures them.
-    clear, offered = np.full(count, search, real), reach * reach
-    before, changed, rows = distance.copy(), False, due
+    clear, offered, rows = np.full(count, search, real), reach * reach, due
     for k in range(2):
-        for i in range(count):
-            if is_due[nearest[k, i]]:
-                distance[k, i] = real(np.inf)
+        for place in range(count):
+            i = np.uint32(place)
+            j = np.uint32(nearest[k, i])
+            best[k, i] = j
+            least[k, i] = real(np.inf) if is_due[j] else least[k, i]
     for turn in range(2):
         for row in range(len(rows)):
             i, mark = rows[row], np.uint32(turn * count + row + 1)
@@ -319,20 +320,20 @@ def _find_some(
                     )
                     ids[number], squares[number] = j, x * x + y * y + z * z
                     number += 1
-            had_above, had_below, own_clear = nearest[0, i], nearest[1, i], search
-            nearest[0, i] = nearest[1, i] = i
-            distance[0, i] = distance[1, i] = reach[i] * reach[i]
+            own_clear = search
+            best[0, i] = best[1, i] = i
+            least[0, i] = least[1, i] = reach[i] * reach[i]
+            if number and not known[i]:
+                known[i] = True
+                across[i] = _across(i, position, frame, is_sheet)
             for place in range(number):
                 j, squared = ids[place], squares[place]
                 own_clear = min(own_clear, squared)
-                if squared < reach[i] * reach[i]:
-                    _find_across(i, position, frame, is_sheet, across, known)
-                    above = _height_of(j, i, points, is_sheet, across)
-                    _compare(i, j, above, squared, level, squash, nearest, distance)
-            changed |= (nearest[0, i] != had_above) | (nearest[1, i] != had_below)
+                above = _height_of(j, i, points, is_sheet, across)
+                _compare(i, j, above, squared, level, squash, least, best)
             if turn == 1:
                 continue
-            free = _free(min(distance[0, i], distance[1, i]), own_clear, touching[i], squash[i])
+            free = _free(min(least[0, i], least[1, i]), own_clear, touching[i], squash[i])
             allowance[i] = max(slack[i], half * free)
             for place in range(number):
                 j, squared = ids[place], squares[place]
@@ -340,14 +341,14 @@ def _find_some(
                     continue
                 clear[j] = min(clear[j], squared)
                 if squared < reach[j] * reach[j]:
-                    _find_across(j, position, frame, is_sheet, across, known)
+                    if not known[j]:
+                        known[j] = True
+                        across[j] = _across(j, position, frame, is_sheet)
                     above = _height_of(i, j, points, is_sheet, across)
                     far = squared + squash[j] * above * above
                     if far < reach[j] * reach[j]:
-                        had_above, had_below = nearest[0, j], nearest[1, j]
                         offered[j] = min(offered[j], far)
-                        _compare(j, i, above, squared, level, squash, nearest, distance)
-                        changed |= (nearest[0, j] != had_above) | (nearest[1, j] != had_below)
+                        _compare(j, i, above, squared, level, squash, least, best)
         if turn == 0:
             lost, num_lost = np.empty(count, np.uint32), np.uint32(0)
             for place in range(count):
@@ -356,8 +357,8 @@ def _find_some(
                 num_lost += np.uint32(
                     not is_due[i]
                     and (
-                        _lost(before[0, i], distance[0, i], slack[i])
-                        or _lost(before[1, i], distance[1, i], slack[i])
+                        _lost(distance[0, i], least[0, i], slack[i])
+                        or _lost(distance[1, i], least[1, i], slack[i])
                     )
                 )
             rows = lost[:num_lost]
@@ -376,7 +377,13 @@ def _find_some(
             found_at[axis, i] = position[axis][i]
     for i in rows:
         is_due[i] = True
-    return changed
+    changed = False
+    for k in range(2):
+        for place in range(count):
+            i = np.uintp(place)
+            changed |= np.uint32(nearest[k, i]) != best[k, i]
+            nearest[k, i], distance[k, i] = best[k, i], least[k, i]
+    return changed, across, known
 
 
 @njit(inline="always")
@@ -547,7 +554,7 @@ def _find_across(i, position, frame, is_sheet, across, known):
 
 @njit(inline="always")
 @no_type_check
-def _compare(i, j, above, squared, level, squash, nearest, distance):
+def _compare(i, j, above, squared, level, squash, distance, nearest):
     """Whether j, that far above i, is the nearest so far on one side of i, or on both."""
     squared = squared + squash[i] * above * above
     # Selections, not branches: which way they go is anybody's guess.
