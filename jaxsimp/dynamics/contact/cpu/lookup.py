@@ -91,8 +91,10 @@ def look_up(
             j = partner[k, i]
             if j != i and (renewed[k, i] | is_due[i] | is_due[j]):
                 renewed[k, i] = True
-                _find_across(i, position, frame, is_sheet, across, known)
-                _find_across(j, position, frame, is_sheet, across, known)
+                if not known[i]:
+                    _find_across(i, position, frame, is_sheet, across, known)
+                if not known[j]:
+                    _find_across(j, position, frame, is_sheet, across, known)
                 _direct(i, j, k, position, across, is_sheet, level, direction)
 
 
@@ -128,7 +130,7 @@ def _find_due(position, found_at, allowance, due, is_due):
     return number
 
 
-@njit(inline="always")
+@compiled
 @no_type_check
 def _num_beyond(position, found_at, allowance, common_x, common_y, common_z):
     """Number of particles that moved farther than allowed, apart from what all moved."""
@@ -143,7 +145,7 @@ def _num_beyond(position, found_at, allowance, common_x, common_y, common_z):
     return number
 
 
-@njit(inline="always")
+@compiled
 @no_type_check
 def _middle_of_moves(position, found_at):
     """Half way between the least and the greatest, along an axis."""
@@ -324,8 +326,7 @@ def _find_some(
             best[0, i] = best[1, i] = i
             least[0, i] = least[1, i] = reach[i] * reach[i]
             if number and not known[i]:
-                known[i] = True
-                across[i] = _across(i, position, frame, is_sheet)
+                _find_across(i, position, frame, is_sheet, across, known)
             for place in range(number):
                 j, squared = ids[place], squares[place]
                 own_clear = min(own_clear, squared)
@@ -342,8 +343,7 @@ def _find_some(
                 clear[j] = min(clear[j], squared)
                 if squared < reach[j] * reach[j]:
                     if not known[j]:
-                        known[j] = True
-                        across[j] = _across(j, position, frame, is_sheet)
+                        _find_across(j, position, frame, is_sheet, across, known)
                     above = _height_of(i, j, points, is_sheet, across)
                     far = squared + squash[j] * above * above
                     if far < reach[j] * reach[j]:
@@ -543,13 +543,12 @@ def _height_of(j, i, points, is_sheet, across):
     return _height(i, x, y, z, is_sheet, across)
 
 
-@njit(inline="always")
+@compiled
 @no_type_check
 def _find_across(i, position, frame, is_sheet, across, known):
-    """Write the unit normal of the sheet, or tangent of the rope, at a particle, if need be."""
-    if not known[i]:
-        known[i] = True
-        across[i] = _across(i, position, frame, is_sheet)
+    """Write the unit normal of the sheet, or tangent of the rope, at a particle."""
+    known[i] = True
+    across[i] = _across(i, position, frame, is_sheet)
 
 
 @njit(inline="always")
