@@ -10,6 +10,7 @@ tiles, so that memory grows with the number of particles alone.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -120,7 +121,8 @@ def _look_up(tree: PyTreeDef, leaves: list[Array]) -> list[Array]:
     settings, contacts, position = jax.tree.unflatten(tree, leaves)
     due, found_at = _due(contacts, position)
     due |= FEW * due.sum() > len(due)
-    nearest, distance, free, offered = _compare(settings, position, due, contacts)
+    nearest, distance, free, *offers = _compare(tree, leaves, due)
+    offered = Offered(*offers)
     # The others: what they had is due, too, and is among what is offered, if it is near still.
     known = jnp.where(due[contacts.nearest], jnp.inf, contacts.distance)
     is_taken = ~due[None] & (offered.distance < known)
@@ -130,7 +132,7 @@ def _look_up(tree: PyTreeDef, leaves: list[Array]) -> list[Array]:
     is_lost = (distance > contacts.distance) & (distance > farthest * farthest)
     lost = is_lost.any(axis=0) & ~due
     found = replace(contacts, nearest=nearest, distance=distance)
-    nearest, distance, _, _ = _compare(settings, position, lost, found)
+    nearest, distance, *_ = _compare(tree, jax.tree.leaves((settings, found, position)), lost)
     partner, listed_by = list_pairs(nearest)
     found_at = jnp.where(due, position, found_at)
     moved = position - found_at
@@ -159,18 +161,16 @@ class Offered(NamedTuple):
     free: Float[Array, " N"]
 
 
-def _compare(
-    settings: SelfContact,
-    position: Float[Array, "3 N"],
-    chosen: Bool[Array, " N"],
-    contacts: Contacts,
-) -> tuple[Int[Array, "2 N"], Float[Array, "2 N"], Float[Array, " N"], Offered]:
+@partial(jax.jit, static_argnums=0)
+def _compare(tree: PyTreeDef, leaves: list[Array], chosen: Bool[Array, " N"]) -> list[Array]:
     """Compare the chosen particles with all, in tiles.
 
     Returns:
         The fields `nearest` and `distance` with new values for the chosen, the distance that each
-        of them may come nearer to others until it touches one, and what they offer to the others.
+        of them may come nearer to others until it touches one, and what they offer to the others,
+        the fields of `Offered`.
     """
+    settings, contacts, position = jax.tree.unflatten(tree, leaves)
     count, level = position.shape[1], LEVEL * settings.thickness
     stretch = jnp.sqrt(1 + settings.squash)
     touching, reach, search = listing_distances(settings)
@@ -234,7 +234,7 @@ def _compare(
         lambda carry: carry[0] * TILE < number, tile, carry
     )
     free_of = jnp.where(clear < search, free(offered_distance, clear, everyone), jnp.inf)
-    return nearest, distance, own_free, Offered(offered, offered_distance, free_of)
+    return [nearest, distance, own_free, offered, offered_distance, free_of]
 
 
 def list_pairs(best: Int[Array, "2 N"]) -> tuple[Int[Array, "2 N"], Int[Array, "C N"]]:
