@@ -29,7 +29,8 @@ if not os.environ.get("JAXSIMP_OPTIMISED"):
     if jaxlib.version.__version_info__ < (0, 11):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
 
-jax.config.update("jax_platforms", "cpu")
+if not os.environ.get("JAXSIMP_GPU"):
+    jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Many programs were compiled before: by another planner, an earlier test or the process that
 # started this one. They are kept for as long as this process lives, in a folder of its own, since

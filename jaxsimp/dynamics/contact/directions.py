@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsimp.dynamics.contact.contacts import PLAIN, Contacts, Exchange
 from jaxsimp.dynamics.contact.settings import LEVEL, SelfContact
@@ -32,11 +32,42 @@ def directions(
     return direct(settings.thickness, away, mine, theirs[3:])
 
 
-def across(settings: SelfContact, position: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
-    """Unit normals of a sheet, or tangents of a rope."""
-    a, b, c, d = (position[:, ids] for ids in settings.frame)
+def across(
+    settings: SelfContact, position: Float[Array, "3 N"], *, reversible: bool = False
+) -> Float[Array, "3 N"]:
+    """Unit normals of a sheet, or tangents of a rope.
+
+    Args:
+        settings: how the body touches itself.
+        position: positions, metres.
+        reversible: whether to be differentiable in reverse mode alone, by gathers of a fixed
+            number in a fixed order: JAX's own reverse is a scatter, whose order a GPU does not fix.
+    """
+    gather = _reversible_corners if reversible else _corners
+    corners = gather(settings.frame, settings.framed, position)
+    a, b, c, d = (corners[:, each] for each in range(4))
     vector = jnp.cross(a - b, c - d, axis=0) if settings.is_sheet else a - b
     return unit(vector, jnp.zeros_like(vector).at[2].set(1.0))
+
+
+def _corners(
+    frame: Int[Array, "4 N"], framed: Int[Array, "D N"], position: Float[Array, "3 N"]
+) -> Float[Array, "3 4 N"]:
+    """Positions of the particles of each frame."""
+    return position.at[:, frame].get(mode="promise_in_bounds")
+
+
+def _keep_places(frame: Array, framed: Array, position: Array) -> tuple[Array, Array]:
+    return _corners(frame, framed, position), framed
+
+
+def _corners_bar(framed: Array, bar: Array) -> tuple[None, None, Array]:
+    flat = jnp.pad(bar.reshape(3, -1), ((0, 0), (0, 1)))
+    return None, None, flat.at[:, framed].get(mode="promise_in_bounds").sum(axis=1)
+
+
+_reversible_corners = jax.custom_vjp(_corners)
+_reversible_corners.defvjp(_keep_places, _corners_bar)
 
 
 def _of_sheets(

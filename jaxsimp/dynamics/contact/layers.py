@@ -170,7 +170,8 @@ def _directions_bar(
     direction_bar = jnp.where(after.renewed[None], direction_bar, 0.0)
 
     def found(position: Float[Array, "3 N"]) -> Float[Array, "3 2 N"]:
-        return directions(settings, after, position, across(settings, position), REVERSIBLE)
+        normal = across(settings, position, reversible=True)
+        return directions(settings, after, position, normal, REVERSIBLE)
 
     return jax.vjp(found, position)[1](direction_bar)[0]
 

@@ -42,6 +42,7 @@ MOST_LAYERS_OF_ROPES = 0.75
     jax.tree_util.register_dataclass,
     data_fields=[
         "frame",
+        "framed",
         "adjacent",
         "thickness",
         "lateral",
@@ -59,6 +60,7 @@ class SelfContact:
     Attributes:
         frame: ids `a, b, c, d` for each particle: its sheet's normal is along
             `(x_a - x_b) x (x_c - x_d)`, its rope's tangent along `x_a - x_b`, shape (4, N).
+        framed: places of each particle in the flattened `frame`, shape (D, N); 4 N after the last.
         adjacent: ids of the particles too near along the body to touch each particle, itself
             included and repeated after the last, shape (N, K).
         thickness: distance that layers are held apart, `SPARE` times the body's, metres.
@@ -73,6 +75,7 @@ class SelfContact:
     """
 
     frame: Int[Array, "... 4 N"]
+    framed: Int[Array, "... D N"]
     adjacent: Int[Array, "... N K"]
     thickness: Float[Array, "..."]
     lateral: Float[Array, "... N"]
@@ -150,8 +153,10 @@ def make_self_contact(
     def array(value: float | np.ndarray) -> Array:
         return jnp.asarray(value, dtype=float)
 
+    frames = _frames(body)
     return SelfContact(
-        frame=jnp.asarray(_frames(body), dtype=int),
+        frame=jnp.asarray(frames, dtype=int),
+        framed=jnp.asarray(_places(frames), dtype=int),
         adjacent=jnp.asarray(_adjacent(body), dtype=int),
         thickness=array(SPARE * thickness),
         lateral=array(1.2 * covering),
@@ -224,6 +229,18 @@ def _frames(body: Body) -> np.ndarray:
         square = np.argmax(np.linalg.norm(np.cross(along[best], along), axis=1))
         frames[:, particle] = ids[[first[best], second[best], first[square], second[square]]]
     return frames
+
+
+def _places(frames: Int[np.ndarray, "4 N"]) -> Int[np.ndarray, "D N"]:
+    """Places for `SelfContact.framed`."""
+    particles = frames.ravel()
+    order = np.argsort(particles, kind="stable")
+    number = np.bincount(particles, minlength=frames.shape[1])
+    first = np.cumsum(number) - number
+    places = np.full((number.max(), frames.shape[1]), frames.size)
+    rank = np.arange(frames.size) - first[particles[order]]
+    places[rank, particles[order]] = order
+    return places
 
 
 def _next(body: Body) -> Int[np.ndarray, "_ 2"]:
