@@ -20,7 +20,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsimp.dynamics.contact.contacts import CAPACITY, Contacts
 from jaxsimp.dynamics.contact.directions import across, directions, dot
-from jaxsimp.dynamics.contact.settings import FEW, LEVEL, SelfContact, listing_distances
+from jaxsimp.dynamics.contact.settings import (
+    ALONE,
+    FEW,
+    LEVEL,
+    SelfContact,
+    listing_distances,
+)
 
 TILE = 64
 """Particles that are compared with all others at a time."""
@@ -120,7 +126,8 @@ def _look_up(tree: PyTreeDef, leaves: list[Array]) -> list[Array]:
     """The fields `LOOKED_UP`, where some particles are due."""
     settings, contacts, position = jax.tree.unflatten(tree, leaves)
     due, found_at = _due(contacts, position)
-    due |= FEW * due.sum() > len(due)
+    number = due.sum()
+    due |= (number > ALONE) | (FEW * number > len(due))
     nearest, distance, free, *offers = _compare(tree, leaves, due)
     offered = Offered(*offers)
     # The others: what they had is due, too, and is among what is offered, if it is near still.

@@ -28,6 +28,8 @@ DETOUR = 1.1
 """Ratio of the distance along springs to that along the body, at most: 1.08 on a square grid."""
 FEW = 16
 """Particles that are due are looked up alone if they are at most one in so many, else all are."""
+ALONE = 40
+"""Most particles that are looked up alone: each is compared with all, without cells."""
 SLACK = 0.25
 """Distance that a particle in contact may move until the next lookup, in radii of its disc."""
 AHEAD = 1

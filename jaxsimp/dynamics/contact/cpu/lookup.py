@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from jaxsimp.dynamics.contact.cpu.foreign import compiled
-from jaxsimp.dynamics.contact.settings import FEW
+from jaxsimp.dynamics.contact.settings import ALONE, FEW
 
 LANES = 16
 """Particles that are compared at a time."""
@@ -53,7 +53,7 @@ def look_up(
     num_due = _find_due(position, found_at, allowance, due, is_due)
     if num_due == 0:
         return
-    if num_due * FEW > count:
+    if num_due > ALONE or num_due * FEW > count:
         across, known = _find_all(
             position,
             nearest,
