@@ -24,7 +24,10 @@ def gpus() -> list[jax.Device]:
         return []
 
 
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not gpus(), reason="no GPU")]
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not gpus(), reason="needs a GPU, and JAXSIMP_GPU=1"),
+]
 
 
 def on(device: jax.Device, self_contact: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -116,6 +116,21 @@ def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
     return points, _oriented(points, faces)
 
 
+def covering_radii(
+    points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, " F"]:
+    """Least radius of discs about the corners of each triangle that cover it, shape (F,), metres.
+
+    The radius of the circle through the corners, or half the longest side of an obtuse triangle.
+    """
+    corners = points[faces]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    longest = sides.max(axis=1)
+    obtuse = 2 * longest**2 > (sides**2).sum(axis=1) * (1 + 1e-9)
+    area = np.where(obtuse, 1.0, face_areas(points, faces))  # which may be 0
+    return np.where(obtuse, longest / 2, sides.prod(axis=1) / (4 * area))
+
+
 def face_areas(points: Points, faces: Faces) -> Float[np.ndarray, " F"]:
     """Areas of the triangles, shape (F,), square metres."""
     a, b, c = points[faces].transpose(1, 0, 2)

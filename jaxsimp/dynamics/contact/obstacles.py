@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.material import FAMILIES
-from jaxsimp.bodies.meshes import face_areas
+from jaxsimp.bodies.meshes import covering_radii
 
 Values = Float[Array | np.ndarray, "..."] | float
 """One number for each point."""
@@ -219,12 +219,7 @@ def gap(body: Body) -> float:
     """
     if not len(body.faces):
         return float(body.rest_length[body.families == STRETCH].max(initial=0.0)) / 2
-    corners = body.rest[body.faces]
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    longest = sides.max(axis=1)
-    obtuse = 2 * longest**2 > (sides**2).sum(axis=1) * (1 + 1e-9)
-    area = np.where(obtuse, 1.0, face_areas(body.rest, body.faces))  # which may be 0
-    return float(np.where(obtuse, longest / 2, sides.prod(axis=1) / (4 * area)).max())
+    return float(covering_radii(body.rest, body.faces).max())
 
 
 def least_radius(body: Body) -> float:

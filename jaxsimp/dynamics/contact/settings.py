@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsimp.bodies import Body
-from jaxsimp.bodies.meshes import face_areas
+from jaxsimp.bodies.meshes import covering_radii
 from jaxsimp.bodies.topology import half_edges, neighbours
 
 TOP_SPEED = 2.1
@@ -146,7 +146,7 @@ def make_self_contact(
             f"of {1e3 * time_step:.3g} ms. Take smaller limits, longer actions, a smaller time "
             f"step, or a larger thickness; or leave self-contact out"
         )
-    covering = _covering_radii(body) if is_sheet else np.sqrt(0.5) * _spacings(body)
+    covering = _disc_radii(body) if is_sheet else np.sqrt(0.5) * _spacings(body)
     # Of the layers above, the next counts as nearest: (k d)^2 + covering^2 < (2 k d)^2.
     stretch = (
         np.maximum(1.0, covering**2 / (3 * thickness**2)) if is_sheet else np.ones(len(covering))
@@ -177,15 +177,9 @@ def _spacings(body: Body) -> Float[np.ndarray, " N"]:
     return np.full(body.num_particles, shortest.max())
 
 
-def _covering_radii(body: Body) -> Float[np.ndarray, " N"]:
-    """Discs this large about the corners of each triangle cover it, metres."""
-    corners = body.rest[body.faces]
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    area = face_areas(body.rest, body.faces)
-    around = sides.prod(axis=1) / (4 * area)
-    longest = sides.max(axis=1)
-    obtuse = 2 * longest**2 > (sides**2).sum(axis=1)
-    radius = np.where(obtuse, longest / 2, around)
+def _disc_radii(body: Body) -> Float[np.ndarray, " N"]:
+    """Radii of discs about the particles that cover every triangle, metres."""
+    radius = covering_radii(body.rest, body.faces)
     largest = np.zeros(body.num_particles)
     np.maximum.at(largest, body.faces, radius[:, None])
     return np.where(largest > 0, largest, radius.max())

@@ -11,9 +11,7 @@ from typing import Any, no_type_check  # numba needs functions as they are, not 
 
 import jax
 import numpy as np
-
-# numba gathers these names at import, where mypy does not see them.
-from numba import carray, cfunc, njit, types  # type: ignore[attr-defined] # see above
+from numba import carray, cfunc, njit, types  # type: ignore[attr-defined] # gathered at import
 from numba.extending import intrinsic
 
 MAJOR, MINOR = 0, 3

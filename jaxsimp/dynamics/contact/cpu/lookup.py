@@ -47,10 +47,11 @@ def look_up(
     """Look up the particles that moved too far, or all; list pairs, and find their directions."""
     renewed[:] = False
     real, count = position[0].dtype.type, len(allowance)
-    if _num_beyond(position, found_at, allowance, real(0), real(0), real(0)) == 0:
+    alone = _num_beyond(position, found_at, allowance, real(0), real(0), real(0))
+    if alone == 0:
         return
     due, is_due = np.empty(count, np.uint32), np.empty(count, np.bool_)
-    num_due = _find_due(position, found_at, allowance, due, is_due)
+    num_due = _find_due(position, found_at, allowance, alone, due, is_due)
     if num_due == 0:
         return
     if num_due > ALONE or num_due * FEW > count:
@@ -100,15 +101,17 @@ def look_up(
 
 @njit(inline="always")
 @no_type_check
-def _find_due(position, found_at, allowance, due, is_due):
-    """List and mark those that moved too far, see ../lookup.py; returns their number."""
+def _find_due(position, found_at, allowance, alone, due, is_due):
+    """List and mark those that moved too far, see ../lookup.py; returns their number.
+
+    `alone` is the number of those that moved too far by themselves.
+    """
     x, y, z = (
         _middle_of_moves(position[0], found_at[0]),
         _middle_of_moves(position[1], found_at[1]),
         _middle_of_moves(position[2], found_at[2]),
     )
     zero, number = allowance.dtype.type(0), np.uint32(0)
-    alone = _num_beyond(position, found_at, allowance, zero, zero, zero)
     along = _num_beyond(position, found_at, allowance, x, y, z)
     if along == 0:
         return number
@@ -204,7 +207,7 @@ def _find_all(
     order, place_of, start, rows, columns = _sorted_into_cells(position, search)
     search = search * search
     clear = np.full(count, search, real)
-    # Of their own: LLVM makes loops of half the speed, or less, of arrays that are handed in.
+    # Of their own: with arrays that are handed in, a lookup at 25 x 25 took 105 to 200 us, not 55.
     across, known = np.empty((count, 3), real), np.zeros(count, np.bool_)
     least, best = np.empty((2, count), real), np.empty((2, count), np.uint32)
     farthest = real(0)
