@@ -1,0 +1,108 @@
+"""The door for numbers: a `ValueError` that names the value, the limits and the remedy."""
+
+from collections.abc import Collection
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+
+MOST = 2**31 - 1
+"""Largest count, that of a 32-bit index."""
+
+
+def require_count(name: str, value: object, least: int, most: int = MOST) -> int:
+    """A whole number, as an `int`.
+
+    Args:
+        name: name of the number, for the message.
+        value: what was given. A bool is no number.
+        least: smallest value allowed.
+        most: largest value allowed.
+
+    Raises:
+        ValueError: if the value is no whole number from `least` to `most`.
+    """
+    whole = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
+    if whole is None or not least <= whole <= most:
+        limits = f"of at least {least}" if most == MOST else f"from {least} to {most}"
+        raise ValueError(f"{name} is {_told(value)}; give a whole number {limits}")
+    return whole
+
+
+def require_number(
+    name: str, value: object, lowest: float, highest: float, unit: str = ""
+) -> float:
+    """A real number within limits, as a `float`.
+
+    Args:
+        name: name of the number, for the message.
+        value: what was given.
+        lowest: smallest value allowed.
+        highest: largest value allowed.
+        unit: its unit, for the message.
+
+    Raises:
+        ValueError: if the value is not one real number from `lowest` to `highest`.
+    """
+    array = as_reals(value)
+    if array is None or array.ndim or not lowest <= array <= highest:
+        raise ValueError(
+            f"{name} is {_told(value)}; give a number {_limits(lowest, highest, unit)}"
+        )
+    return float(array)
+
+
+def require_numbers(
+    name: str, values: object, lowest: float, highest: float, unit: str = ""
+) -> np.ndarray:
+    """Real numbers within limits, of any shape, as an array of floats.
+
+    Args:
+        name: name of the numbers, for the message.
+        values: what was given.
+        lowest: smallest value allowed.
+        highest: largest value allowed.
+        unit: their unit, for the message.
+
+    Raises:
+        ValueError: if a value is not a real number from `lowest` to `highest`.
+    """
+    array = as_reals(values)
+    limits = _limits(lowest, highest, unit)
+    if array is None:
+        raise ValueError(f"{name} is {_told(values)}; give an array of numbers {limits}")
+    wrong = np.argwhere(~((lowest <= array) & (array <= highest)))  # NaN, too
+    if len(wrong):
+        where = tuple(wrong[0].tolist())
+        told = f"{name}[{', '.join(map(str, where))}]" if where else name
+        raise ValueError(f"{told} is {array[where]:g}; give numbers {limits}")
+    return array
+
+
+def require_choice(name: str, value: object, known: Collection[str]) -> None:
+    """Raise a `ValueError` unless a value is one of the known names."""
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name} is {_told(value)}; choose from {', '.join(known)}")
+
+
+def as_reals(values: object) -> np.ndarray | None:
+    """Values as an array of floats; None if they are no real numbers, or no rectangular array."""
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError):
+        return None
+    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
+        return None
+    return array.astype(float)
+
+
+def _limits(lowest: float, highest: float, unit: str) -> str:
+    return f"from {lowest:g} to {highest:g}{' ' * bool(unit)}{unit}"
+
+
+def _told(value: Any) -> str:
+    """A value as a short text: an array by its type and shape."""
+    if isinstance(value, np.ndarray) and value.ndim:
+        return f"an array of {value.dtype}, shape {value.shape}"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
