@@ -30,6 +30,7 @@ SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {
     "scaling": rollouts.scaling,
     "self_contact": contact.self_contact,
     "crumpling": contact.crumpling,
+    "contact_population": contact.contact_population,
     "contact_gradient": contact.contact_gradient,
 }
 
@@ -89,7 +90,7 @@ def run(options: Options, scale: Scale, console: Console) -> list[Row]:
         bar = progress.add_task("", total=len(names))
         for name in names:
             progress.update(bar, description=name)
-            found = [row | {"section": name} for row in SECTIONS[name](scale)]
+            found = [_placed(row, name, environment["device"]) for row in SECTIONS[name](scale)]
             progress.advance(bar)
             console.print(table(name, found))
             rows.extend(found)
@@ -103,6 +104,13 @@ def run(options: Options, scale: Scale, console: Console) -> list[Row]:
     return rows
 
 
+def _placed(row: Row, section: str, device: str) -> Row:
+    """The row with its section and device."""
+    return row | {"section": section, "device": "cpu" if row["engine"] in ON_HOST else device}
+
+
+ON_HOST = ("c", "numpy", "taichi", "warp", "qpsolvers", "proxsuite")
+"""Engines that run on the CPU, whatever device JAX has."""
 UNITS = {
     "compile_seconds": "compile (s)",
     "run_seconds": "run (ms)",

@@ -28,7 +28,7 @@ from jaxsimp.dynamics import (
     make_simulation,
     rollout,
 )
-from jaxsimp.engines import Layout, PopulationMap
+from jaxsimp.engines import Layout, PopulationMap, default_layout, spring_chunk_size
 
 ACTION_SECONDS = 0.25
 CRUMPLED = 4
@@ -74,6 +74,39 @@ def _with_and_without(name: str, make_plans: MakePlans, scale: Scale) -> Iterato
             ratio_to_without=(float(np.median(taken / seconds[side, False])) if touches else None),
             exponent=exponent if touches else None,
         ) | measured(prepared, taken, population * side**2 * steps[side])
+
+
+def contact_population(scale: Scale) -> Iterator[Row]:
+    """Many folds at a time, with and without self-contact, laid out as planners do on this device.
+
+    The population is larger on a GPU, which is slow for few rollouts.
+    """
+    side, on_cpu = scale.contact_sides[0], jax.devices()[0].platform == "cpu"
+    population = scale.population if on_cpu else max(scale.populations)
+    fold = _folding(side, scale)
+    # Folds that differ: samples that look up in the same steps would be no fair measure.
+    shares = jnp.linspace(0.8, 1.0, population)[:, None, None, None]
+    plans = Actions(jnp.repeat(fold.pick, population, axis=0), shares * fold.displacement)
+    ready, layouts = {}, {}
+    for touches in (False, True):
+        shared = _shared(side, touches)
+        layouts[touches] = default_layout(population, spring_chunk_size(shared[0]))
+        ready[touches] = prepare(partial(_laid_out, shared, plans, layouts[touches]))
+    times = time_in_turns([each.run for each in ready.values()], scale.repeats)
+    ratio = float(np.median(times[:, 1] / times[:, 0]))
+    steps = plans.pick.shape[1] * _action_steps(side)
+    for (touches, prepared), seconds in zip(ready.items(), times.T, strict=True):
+        yield make_row(
+            "contact_population",
+            engine="jaxsimp",
+            body=f"cloth_{side}",
+            population=population,
+            layout="self-contact" if touches else "passes through itself",
+            chunk_size=layouts[touches].chunk_size,
+            workers=layouts[touches].num_workers,
+            steps=steps,
+            ratio_to_without=ratio if touches else None,
+        ) | measured(prepared, seconds, population * side**2 * steps)
 
 
 def contact_gradient(scale: Scale) -> Iterator[Row]:
@@ -128,8 +161,11 @@ def _action_steps(side: int) -> int:
 
 
 def _rollouts(side: int, touches: bool, plans: Actions) -> partial[object]:
-    shared = _shared(side, touches)
-    return partial(PopulationMap(_final, shared, plans, Layout()), shared, plans)
+    return _laid_out(_shared(side, touches), plans, Layout())
+
+
+def _laid_out(shared: Any, plans: Actions, layout: Layout) -> partial[object]:
+    return partial(PopulationMap(_final, shared, plans, layout), shared, plans)
 
 
 def _shared(side: int, touches: bool) -> Any:

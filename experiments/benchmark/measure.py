@@ -12,6 +12,7 @@ import numpy as np
 COLUMNS = (
     "name",
     "engine",
+    "device",
     "body",
     "population",
     "layout",

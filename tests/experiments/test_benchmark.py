@@ -40,6 +40,7 @@ TINY = dataclasses.replace(
     cem_side=5,
     cem_iterations=2,
     goals=(3,),
+    contact_sides=(5,),
 )
 
 # Most of the time here is compilation of code that then runs for a millisecond.
@@ -91,7 +92,7 @@ def results(measure):
 
 @pytest.fixture(scope="module")
 def slow_results(measure):
-    return measure("population", "cem", "scaling")
+    return measure("population", "cem", "scaling", "contact_population")
 
 
 # --- rows -----------------------------------------------------------------------------------------
@@ -110,6 +111,7 @@ def test_rows_have_their_columns(fixture, request):
     for row in rows:
         assert row.keys() > set(COLUMNS)
         assert isinstance(row["engine"], str)
+        assert row["device"] == "cpu"
         for name in ("compile_seconds", "run_seconds", "particle_steps_per_second", "error"):
             assert row[name] is None or isinstance(row[name], float)
             assert row[name] is None or row[name] >= 0
@@ -140,6 +142,14 @@ def test_a_plan_reports_its_cores_and_its_score(slow_results):
     assert plan["score"] <= 1
     # The same rate from times of different parts.
     assert plan["run_seconds"] > iteration["run_seconds"]
+
+
+@pytest.mark.slow
+def test_many_folds_are_compared_with_those_of_a_body_that_passes_through_itself(slow_results):
+    without, touching = of_section(slow_results, "contact_population")
+    assert without["population"] == touching["population"] == TINY.population
+    assert without["ratio_to_without"] is None
+    assert touching["ratio_to_without"] > 0
 
 
 @pytest.mark.slow
