@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 from experiments import plan_options, plan_report, plans, run
+from experiments.goals import GoalsOptions
+from experiments.paper import PaperOptions
 from jaxsimp.planning import CEM, ENCODINGS
 from jaxsimp.records import load_plan
 from jaxsimp.tasks import make_task, score
@@ -310,7 +312,7 @@ def test_list_names_everything(capsys):
 
 
 def test_options_replace_the_settings_of_the_budget():
-    study = run.PaperOptions(
+    study = PaperOptions(
         budget="paper", population=11, smoothing=0.3, keep_best=True, returns="best", num_actions=3
     ).configuration()
     task = study.task("rope_folding")
@@ -329,7 +331,7 @@ def test_options_replace_the_settings_of_the_budget():
 
 
 def test_the_papers_study_compares_both_of_its_encodings():
-    runs = list(run.PaperOptions(seeds=1).configuration().runs("rope_folding"))
+    runs = list(PaperOptions(seeds=1).configuration().runs("rope_folding"))
     encodings = ("categorical", "gaussian_index")
     assert runs == [(space, each, 0) for space in plans.ACTION_SPACES for each in encodings]
 
@@ -337,7 +339,7 @@ def test_the_papers_study_compares_both_of_its_encodings():
 def test_the_paper_budget_is_the_authors():
     # Figures of the author's runs: horizon 15, 0.08 m an axis a step; 70 and 333 plans a round
     # of 20, a tenth of them elites, no smoothing, variance 0.5, the mean returned.
-    study = run.PaperOptions(budget="paper").configuration()
+    study = PaperOptions(budget="paper").configuration()
     for name, population, elites in [
         ("rope_straightening", 70, 7),
         ("cloth_side_folding", 333, 33),
@@ -353,13 +355,13 @@ def test_the_paper_budget_is_the_authors():
 
 def test_studies_that_plan_otherwise_have_another_folder():
     for planning, name in (("nominal", "goals"), ("mixed", "goals-mixed")):
-        options = run.GoalsOptions(planning=planning)
+        options = GoalsOptions(planning=planning)
         assert options.folder().name == name
         assert options.configuration().planning == planning
 
 
 def test_a_smoke_run_is_small():
-    study = run.PaperOptions(smoke=True).configuration()
+    study = PaperOptions(smoke=True).configuration()
     assert study.seeds == 2
     assert study.task("cloth_side_folding").body.num_particles == 81
-    assert run.PaperOptions(smoke=True).folder() != run.PaperOptions().folder()
+    assert PaperOptions(smoke=True).folder() != PaperOptions().folder()

@@ -166,7 +166,7 @@ def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
 
 def test_what_judges_plans_is_part_of_what_a_study_is():
     options = [
-        run.TransferOptions(smoke=True, planning=each)
+        transfer.TransferOptions(smoke=True, planning=each)
         for each in ("nominal", "robust", "self_contact", "mixed")
     ]
     nominal, robust, touching = (each.transfer().identity()["plans"] for each in options[:3])
