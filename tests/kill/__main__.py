@@ -45,8 +45,8 @@ def main() -> int:
     _tell(f"kills: {dict(tally.kills)}")
     _tell(f"where: {dict(tally.stages)}")
     _tell(
-        f"{sum(tally.kills.values())} kills in {tally.folders} folders, {len(tally.faults)} faults, "
-        f"{(time.perf_counter() - began) / 60:.0f} minutes"
+        f"{sum(tally.kills.values())} kills in {tally.folders} folders, "
+        f"{len(tally.faults)} faults, {(time.perf_counter() - began) / 60:.0f} minutes"
     )
     for fault in tally.faults:
         _tell(f"FAULT {fault}")
