@@ -218,7 +218,7 @@ def test_a_killed_process_goes_on_to_the_same_runs(folder, tmp_path):
 
 
 def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch, capsys):
-    def interrupt(*args):
+    def interrupt(*args, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(plan_options, "run_study", interrupt)
