@@ -68,7 +68,7 @@ def set_aside(path: Path) -> Path:
 
 def remove_parts(folder: Path) -> None:
     """Remove what a kill left of files that were being written in a folder, or in one below."""
-    for part in folder.rglob(f"{PART}*"):
+    for part in list(folder.rglob(f"{PART}*")):
         shutil.rmtree(part, ignore_errors=True)
-    for old in folder.rglob("*.part"):  # of version 0.1
+    for old in list(folder.rglob("*.part")):  # of version 0.1
         old.unlink(missing_ok=True)

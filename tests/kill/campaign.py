@@ -1,5 +1,6 @@
 """Studies killed at random moments, and what they leave beside an undisturbed run's."""
 
+import contextlib
 import json
 import os
 import re
@@ -10,7 +11,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -199,7 +199,7 @@ def _compare(
         tell(f"FAULT {tally.faults[-1]}")
 
 
-@contextmanager
+@contextlib.contextmanager
 def _copied(programs: Path) -> Iterator[Path]:
     """A copy of the compiled programs: a kill may cut short what JAX adds to it."""
     own = Path(shutil.copytree(programs, programs.with_name("programs-own")))
@@ -255,11 +255,10 @@ def _await_changes(process: subprocess.Popen[str], folder: Path, number: int) ->
 
 def _listing(folder: Path) -> list[tuple[str, int]]:
     found = []
-    for path in folder.rglob("*"):
-        try:
-            found.append((str(path), path.stat().st_size))
-        except OSError:  # gone meanwhile
-            continue
+    for parent, folders, files in os.walk(folder):  # passes over folders that have gone meanwhile
+        for name in folders + files:
+            with contextlib.suppress(OSError):
+                found.append((f"{parent}/{name}", os.stat(f"{parent}/{name}").st_size))
     return sorted(found)
 
 
