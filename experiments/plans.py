@@ -234,6 +234,21 @@ def set_plan_aside(path: Path, fault: str | None) -> str | None:
     return f"{fault} (kept as {kept.name})"
 
 
+def all_runs(study: PlanStudy) -> list[tuple[str, str, str, int]]:
+    """The identity of every run of a study, in order."""
+    return [(name, *run) for name in study.tasks for run in study.runs(name)]
+
+
+def run_fault(tasks: dict[str, Task], folder: Path, row: dict[str, Any]) -> str | None:
+    """What is wrong with the plan of a row of a folder, or None."""
+    if row["task"] not in tasks:
+        return None
+    file = plan_file(*(row[name] for name in IDENTITY))
+    if row["plan"] != file:
+        return f"the row of {folder / file} names {row['plan']!r}"
+    return plan_fault(folder / file, tasks[row["task"]], (row["final_score"],))
+
+
 def run_study(
     study: PlanStudy, folder: Path, console: Console, *, mixed: bool = False
 ) -> dict[str, Any]:
@@ -243,13 +258,17 @@ def run_study(
         ResultsError: if the folder has rows of another environment, unless `mixed`.
     """
     environment, rows = records.environment(), row_file(folder)
-    fault = partial(_run_fault, {name: study.task(name) for name in study.tasks}, folder)
+    tasks = {name: study.task(name) for name in study.tasks}
+
+    def fault(row: dict[str, Any]) -> str | None:
+        return set_plan_aside(folder / plan_file(*rows.key(row)), run_fault(tasks, folder, row))
+
     rows.resume(environment, mixed=mixed, fault=fault, tell=teller(console))
     console.print("key points of the goals; the first time this compiles, for up to a minute")
     models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
-    runs = [(name, *run) for name in study.tasks for run in study.runs(name)]
+    runs = all_runs(study)
     todo = rows.left(runs)
     left = {
         name: [(space, encoding, seed) for task, space, encoding, seed in todo if task == name]
@@ -262,17 +281,6 @@ def run_study(
         "models": [_model_row(name, model) for name, model in models.items()],
         "runs": rows.in_order(runs),
     }
-
-
-def _run_fault(tasks: dict[str, Task], folder: Path, row: dict[str, Any]) -> str | None:
-    """What is wrong with the plan of a row, whose file is set aside then; or None."""
-    if row["task"] not in tasks:
-        return None
-    file = plan_file(*(row[name] for name in IDENTITY))
-    if row["plan"] != file:
-        return f"the row of {folder / file} names {row['plan']!r}"
-    path = folder / file
-    return set_plan_aside(path, plan_fault(path, tasks[row["task"]], (row["final_score"],)))
 
 
 def _run_all(

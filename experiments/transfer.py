@@ -139,10 +139,12 @@ def _earlier_runs(study: plans.PlanStudy, source: Path) -> list[dict[str, Any]]:
     Raises:
         ResultsError: if a row or a plan is damaged.
     """
-    found, tasks = plans.row_file(source).rows(), {name: study.task(name) for name in study.tasks}
+    rows = plans.row_file(source)
+    by_key = {rows.key(row): row for row in rows.rows()}
+    found = [by_key[run] for run in plans.all_runs(study) if run in by_key]
+    tasks = {name: study.task(name) for name in study.tasks}
     for row in found:
-        fault = plans.plan_fault(source / row["plan"], tasks[row["task"]], (row["final_score"],))
-        if fault:
+        if fault := plans.run_fault(tasks, source, row):
             raise records.ResultsError(f"{fault}; run its study again, which makes it again")
     return found
 

@@ -4,6 +4,7 @@ Ctrl-C has status 130, SIGTERM 143 and SIGHUP 129, as in shells. This module imp
 late: it is loaded before all else, so that a signal during the imports of a command is told, too.
 """
 
+import contextlib
 import signal
 import sys
 import threading
@@ -97,9 +98,10 @@ def _print_error(text: str) -> None:
     from rich.console import Console
 
     line = " ".join(text.split())
-    Console(stderr=True).print(
-        f"error: {line}", style="red", markup=False, highlight=False, soft_wrap=True
-    )
+    with contextlib.suppress(OSError):  # nobody may be there to read it
+        Console(stderr=True).print(
+            f"error: {line}", style="red", markup=False, highlight=False, soft_wrap=True
+        )
 
 
 def _print_last(text: str) -> None:

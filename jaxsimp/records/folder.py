@@ -14,7 +14,7 @@ CONFIG_FILE = "config.json"
 
 @contextmanager
 def open_folder(folder: Path, config: Mapping[str, Any]) -> Iterator[None]:
-    """Make a results folder for a configuration, or open the existing one, and hold it.
+    """Make a results folder for a configuration, or open the existing one, and hold it: a context.
 
     While the context lasts no other process can open the folder. What a kill left of files that
     were being written is removed.
