@@ -4,12 +4,11 @@ Ctrl-C has status 130, SIGTERM 143 and SIGHUP 129, as in shells. This module imp
 late: it is loaded before all else, so that a signal during the imports of a command is told, too.
 """
 
-import contextlib
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
@@ -98,7 +97,7 @@ def _print_error(text: str) -> None:
     from rich.console import Console
 
     line = " ".join(text.split())
-    with contextlib.suppress(OSError):  # nobody may be there to read it
+    with suppress(OSError):  # nobody may be there to read it
         Console(stderr=True).print(
             f"error: {line}", style="red", markup=False, highlight=False, soft_wrap=True
         )

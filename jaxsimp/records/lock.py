@@ -1,12 +1,11 @@
 """One process at a time works in a results folder; the others are told which."""
 
-import contextlib
 import getpass
 import json
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -50,9 +49,9 @@ def lock_folder(folder: Path) -> Iterator[None]:
             raise not_writable(folder, error) from error
         yield
     finally:
-        with contextlib.suppress(OSError):  # the folder may have vanished
+        with suppress(OSError):  # the folder may have vanished
             (folder / HOLDER_FILE).unlink()
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             lock.release()
 
 

@@ -1,6 +1,5 @@
 """Studies killed at random moments, and what they leave beside an undisturbed run's."""
 
-import contextlib
 import json
 import os
 import re
@@ -11,6 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -199,7 +199,7 @@ def _compare(
         tell(f"FAULT {tally.faults[-1]}")
 
 
-@contextlib.contextmanager
+@contextmanager
 def _copied(programs: Path) -> Iterator[Path]:
     """A copy of the compiled programs: a kill may cut short what JAX adds to it."""
     own = Path(shutil.copytree(programs, programs.with_name("programs-own")))
@@ -257,7 +257,7 @@ def _listing(folder: Path) -> list[tuple[str, int]]:
     found = []
     for parent, folders, files in os.walk(folder):  # passes over folders that have gone meanwhile
         for name in folders + files:
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 found.append((f"{parent}/{name}", os.stat(f"{parent}/{name}").st_size))
     return sorted(found)
 
