@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxsimp import records
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -33,19 +35,41 @@ def success_interval(successes: int, count: int) -> tuple[float, float]:
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a figure as PNG, and close it."""
+    """Write a figure as PNG, whole or not at all, and close it."""
     import matplotlib.pyplot as plt
 
-    figure.savefig(path, dpi=150)
+    with records.whole_file(path) as part:
+        figure.savefig(part, dpi=150)
     plt.close(figure)
 
 
-def provenance(environment: dict[str, Any], files: str) -> list[str]:
-    """Lines on the software and machine behind the results of a study, and on its files."""
+def provenance(rows: Iterable[dict[str, Any]], files: str) -> list[str]:
+    """Lines on the software and machine behind the rows of a study, and on its files."""
+    found = records.environments(rows)
+    lines = ["## Provenance"]
+    if len(found) == 1:
+        ((environment, _),) = found
+        lines.append(_environment(environment))
+    else:
+        lines += [
+            f"**The rows are of {len(found)} environments (`--mixed`)**, and differ for that "
+            f"reason, too:",
+            "",
+            *(f"- {number} rows: {_environment(environment)}" for environment, number in found),
+            "",
+        ]
+    return [*lines, f"{files}, settings in `config.json`."]
+
+
+def _environment(environment: dict[str, Any] | None) -> str:
+    if environment is None:
+        return "an unknown environment."
     versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
-    return [
-        "## Provenance",
+    settings = ", ".join(
+        f"`{name}` {value}" for name, value in environment.get("settings", {}).items() if value
+    )
+    return (
         f"Commit `{environment['commit']}`; Python {environment['python']}; {versions}; "
-        f"{environment['processor']}, {environment['cores']} cores; {environment['platform']}. "
-        f"{files}, settings in `config.json`.",
-    ]
+        f"{environment['processor']}, {environment['cores']} cores, {environment['device']}; "
+        f"{environment['platform']}; {settings}."
+    )

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 from rich.console import Console
 
 from experiments.plans import ACTION_SPACES, PlanStudy, run_study
-from experiments.study import default_folder, told_done
+from experiments.study import default_folder, teller, told_done
 from jaxsimp import records
 from jaxsimp.planning import ENCODINGS
 from jaxsimp.tasks import make_task, task_names
@@ -63,6 +63,8 @@ class PlanOptions:
     """Output folder (default: results/paper, or results/paper-smoke)."""
     smoke: bool = False
     """Run everything once in under two minutes: small bodies, few rollouts, two seeds."""
+    mixed: bool = False
+    """Go on in a folder with rows of another environment; the report says so."""
     list: bool = False
     """List the tasks, action spaces and encodings, and exit."""
 
@@ -101,12 +103,13 @@ class PlanOptions:
             _list(console)
             return
         study, folder = self.configuration(), self.folder()
-        records.open_folder(folder, study.identity())
-        # Imported here, so that --help and wrong options do not wait for matplotlib.
-        from experiments.plan_report import write_report
-
         start = time.perf_counter()
-        write_report(study, run_study(study, folder, console), folder)
+        with records.open_folder(folder, study.identity()):
+            # Imported here, so that --help and wrong options do not wait for matplotlib.
+            from experiments.plan_report import write_report
+
+            summary = run_study(study, folder, console, mixed=self.mixed)
+            write_report(study, summary, folder, teller(console))
         told_done(console, folder, start)
 
     def folder(self) -> Path:

@@ -2,13 +2,14 @@
 
 import json
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
-from experiments.plans import PLANS_FOLDER, ROWS_FILE, PlanStudy, key_points
+from experiments.plans import IDENTITY, PLANS_FOLDER, ROWS_FILE, PlanStudy, key_points
 from jaxsimp import records, viz
 
 Rows = list[dict[str, Any]]
@@ -24,8 +25,13 @@ LABELS = {
 }
 
 
-def write_report(study: PlanStudy, summary: dict[str, Any], folder: Path) -> None:
-    """Write `summary.json`, the figures and `report.md`."""
+def write_report(
+    study: PlanStudy, summary: dict[str, Any], folder: Path, tell: Callable[[str], None] = print
+) -> None:
+    """Write `summary.json`, the figures and `report.md`; what is damaged is told.
+
+    Each file is written whole or not at all.
+    """
     records.write_json(folder / SUMMARY_FILE, summary)
     figures = folder / "figures"
     figures.mkdir(exist_ok=True)
@@ -45,9 +51,28 @@ def write_report(study: PlanStudy, summary: dict[str, Any], folder: Path) -> Non
         goal = np.asarray(task.episode_fn(seed).goal)
         figure = viz.plot_executions(task.body, goal, plans, name, task.obstacles)
         save_figure(figure, figures / f"plans_{name}.png")
-    replays = folder / TRANSFER_FILE
-    transfer = json.loads(replays.read_text()) if replays.exists() else []
-    (folder / "report.md").write_text(_report(study, summary, transfer))
+    transfer = _replayed(folder, tell)
+    records.write_text(folder / "report.md", _report(study, summary, transfer))
+
+
+def _replayed(folder: Path, tell: Callable[[str], None]) -> Rows:
+    """Rows of plans that were replayed in MuJoCo; a damaged file is set aside."""
+    path = folder / TRANSFER_FILE
+    if not path.exists():
+        return []
+    try:
+        rows = json.loads(path.read_text())
+        for row in rows:
+            _ = [row[name] for name in (*IDENTITY, "mujoco_full_score")]
+        return rows
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        kept = records.set_aside(path)
+        path.unlink()
+        tell(
+            f"{path} is damaged ({type(error).__name__}: {error}); it is kept as {kept.name}, and "
+            f"`python -m experiments.run transfer --plans {folder}` makes it again"
+        )
+        return []
 
 
 def _of(rows: Rows, **fields: Any) -> Rows:
@@ -116,7 +141,7 @@ def _report(study: PlanStudy, summary: dict[str, Any], transfer: Rows) -> str:
         "For each task the seed whose score is the median of the first method.",
         *(f"![plans](figures/plans_{name}.png)" for name in study.tasks),
         "",
-        *provenance(summary["environment"], f"Rows in `{ROWS_FILE}`, plans in `{PLANS_FOLDER}/`"),
+        *provenance(summary["runs"], f"Rows in `{ROWS_FILE}`, plans in `{PLANS_FOLDER}/`"),
     ]
     return "\n".join(lines) + "\n"
 

@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 
 from experiments.progress import progress_bar
+from experiments.study import teller
 from jaxsimp import records
 from jaxsimp.engines import MassSprings, SearchEngine, Spread, make_ensemble
 from jaxsimp.planning import CEM, ENCODINGS, Planner
@@ -32,6 +33,11 @@ ENSEMBLE_SIZE = 4
 ROWS_FILE = "runs.jsonl"
 IDENTITY = ("task", "action_space", "pick_encoding", "seed")
 """Fields that identify a run."""
+FIELDS = (
+    *("planning", "plan", "final_score", "success", "cost_per_iteration", "rollouts"),
+    *("non_finite", "plan_seconds", "compile_seconds"),
+)
+"""Fields that reports and replays read."""
 PLANS_FOLDER = "plans"
 
 
@@ -183,22 +189,95 @@ def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) ->
             raise ValueError(f"{kind} {name!r} is given twice; give it once")
 
 
-def run_study(study: PlanStudy, folder: Path, console: Console) -> dict[str, Any]:
-    """Run the combinations missing from the folder, and return the summary of all in it."""
+def row_file(folder: Path) -> records.RowFile:
+    """The rows of a study of plans."""
+    return records.RowFile(folder / ROWS_FILE, IDENTITY, FIELDS)
+
+
+def plan_file(task: str, action_space: str, encoding: str, seed: int) -> str:
+    """Path of the plan of a run, in the folder of its study."""
+    return f"{PLANS_FOLDER}/{task}-{action_space}-{encoding}-{seed}.npz"
+
+
+def plan_fault(path: Path, task: Task, scores: tuple[float | None, ...] = ()) -> str | None:
+    """What is wrong with a plan file, or None.
+
+    Args:
+        path: path of the file.
+        task: the task that the plan is for.
+        scores: the score that the file must have; any if empty.
+    """
+    if not path.exists():
+        return f"{path} is missing"
+    try:
+        plan = records.load_plan(path)
+    except ValueError as error:
+        return str(error)
+    frames = (task.num_actions + 2, task.body.num_particles, 3)
+    picks = (task.num_actions, task.num_pickers)
+    if plan.positions.shape != frames or plan.actions.pick.shape != picks:
+        return (
+            f"{path} has positions of shape {plan.positions.shape} and picks of shape "
+            f"{plan.actions.pick.shape}, not {frames} and {picks}"
+        )
+    if scores and plan.about.get("score", "none is there") not in scores:
+        return f"{path} has another score than its row"
+    return None
+
+
+def set_plan_aside(path: Path, fault: str | None) -> str | None:
+    """Give a plan file with a fault another name, and return the fault with that name."""
+    if fault is None or not path.exists():
+        return fault
+    kept = records.set_aside(path)
+    path.unlink()
+    return f"{fault} (kept as {kept.name})"
+
+
+def all_runs(study: PlanStudy) -> list[tuple[str, str, str, int]]:
+    """The identity of every run of a study, in order."""
+    return [(name, *run) for name in study.tasks for run in study.runs(name)]
+
+
+def run_fault(tasks: dict[str, Task], folder: Path, row: dict[str, Any]) -> str | None:
+    """What is wrong with the plan of a row of a folder, or None."""
+    if row["task"] not in tasks:
+        return None
+    file = plan_file(*(row[name] for name in IDENTITY))
+    if row["plan"] != file:
+        return f"the row of {folder / file} names {row['plan']!r}"
+    return plan_fault(folder / file, tasks[row["task"]], (row["final_score"],))
+
+
+def run_study(
+    study: PlanStudy, folder: Path, console: Console, *, mixed: bool = False
+) -> dict[str, Any]:
+    """Run the combinations missing from the folder, and return the summary of all in it.
+
+    Raises:
+        ResultsError: if the folder has rows of another environment, unless `mixed`.
+    """
+    environment, rows = records.environment(), row_file(folder)
+    tasks = {name: study.task(name) for name in study.tasks}
+
+    def fault(row: dict[str, Any]) -> str | None:
+        return set_plan_aside(folder / plan_file(*rows.key(row)), run_fault(tasks, folder, row))
+
+    rows.resume(environment, mixed=mixed, fault=fault, tell=teller(console))
+    console.print("key points of the goals; the first time this compiles, for up to a minute")
     models = {name: key_points(study, name) for name in study.tasks}
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
-    rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
-    runs = [(name, *run) for name in study.tasks for run in study.runs(name)]
+    runs = all_runs(study)
     todo = rows.left(runs)
     left = {
         name: [(space, encoding, seed) for task, space, encoding, seed in todo if task == name]
         for name in study.tasks
     }
     if todo:
-        _run_all(study, models, left, folder, console)
+        _run_all(study, models, left, folder, environment, console)
     return {
-        "environment": records.environment(),
+        "environment": environment,
         "models": [_model_row(name, model) for name, model in models.items()],
         "runs": rows.in_order(runs),
     }
@@ -209,13 +288,14 @@ def _run_all(
     models: dict[str, KeyPoints],
     left: dict[str, list[tuple[str, str, int]]],
     folder: Path,
+    environment: dict[str, Any],
     console: Console,
 ) -> None:
     """Compile, estimate, and run task by task, writing a row after each run."""
     (folder / PLANS_FOLDER).mkdir(exist_ok=True)
-    environment = records.environment()
     planners, seconds, compiled = {}, {}, {}
     for name in (name for name, runs in left.items() if runs):
+        console.print(f"{name}: compiling")
         task = study.task(name)
         evaluator = MassSprings(self_contact=study.self_contact)
         planners[name] = Planner(task, study.engine(task), evaluator)
@@ -258,7 +338,7 @@ def _run(
     algorithm = dataclasses.replace(algorithm, encoding=ENCODINGS[encoding])
     plan = planner.plan(episode, candidates, algorithm, seed, on_ask)
     execution = planner.execute(episode, plan.actions)
-    file = f"{PLANS_FOLDER}/{task.name}-{action_space}-{encoding}-{seed}.npz"
+    file = plan_file(task.name, action_space, encoding, seed)
     records.save_plan(
         folder / file,
         task,

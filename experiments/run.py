@@ -1,37 +1,50 @@
 """Run a study: `python -m experiments.run`. All options: `python -m experiments.run --help`."""
 
-import inspect
 import sys
+from typing import TYPE_CHECKING
 
-import tyro
-from rich.console import Console
-
-from experiments.goals import GoalsOptions
-from experiments.paper import PaperOptions
-from experiments.simplification import SimplificationOptions
-from experiments.study import StudyOptions
-from experiments.transfer import TransferOptions
 from jaxsimp.cli.status import exit_status
 
-STUDIES: dict[str, type[StudyOptions]] = {
-    options.NAME: options
-    for options in (PaperOptions, GoalsOptions, SimplificationOptions, TransferOptions)
+if TYPE_CHECKING:
+    from experiments.study import StudyOptions
+
+STUDIES = {
+    "paper": "PaperOptions",
+    "goals": "GoalsOptions",
+    "simplification": "SimplificationOptions",
+    "transfer": "TransferOptions",
 }
-"""Options of the studies by name; the first study is the default."""
+"""The class of options of each study, in the module of its name; the first study is the default.
+
+It is imported when the study runs: the imports take seconds, in which a signal is told, too.
+"""
 
 
 def main() -> int:
-    """Run the command line; the exit status is 0, 2 for a wrong request, 130 for Ctrl-C."""
-    return exit_status(_run, "interrupted; the same command resumes it")
+    """Run the command line.
+
+    Returns:
+        The exit status: 0; 2 for a wrong request, or a folder or disk that cannot be used; 130
+        for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP.
+    """
+    resumed = "the same command resumes it"
+    return exit_status(_run, f"interrupted; {resumed}", f"once that is cured, {resumed}")
 
 
 def _run() -> int:
     name, arguments = _study(sys.argv[1:])
+    import inspect
+    from importlib import import_module
+
+    import tyro
+    from rich.console import Console
+
+    study: type[StudyOptions] = getattr(import_module(f"experiments.{name}"), STUDIES[name])
     options = tyro.cli(
-        STUDIES[name],
+        study,
         prog=f"python -m experiments.run {name}",
         args=arguments,
-        description=f"{inspect.getdoc(STUDIES[name])}\n\nStudies: {', '.join(STUDIES)}.",
+        description=f"{inspect.getdoc(study)}\n\nStudies: {', '.join(STUDIES)}.",
     )
     options.run(Console())
     return 0

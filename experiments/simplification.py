@@ -27,7 +27,7 @@ from experiments.ideal_goals import (
 )
 from experiments.progress import progress_bar
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
-from experiments.study import default_folder
+from experiments.study import default_folder, teller
 from jaxsimp import records
 from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.simplification import METHODS, simplify_batch
@@ -35,6 +35,8 @@ from jaxsimp.simplification import METHODS, simplify_batch
 ROWS_FILE = "goals.jsonl"
 IDENTITY = ("kind", "name", "size", "noise", "level", "gap", "rounding", "seed", "method")
 """Fields that identify a row: those of a `Case`, and the method."""
+FIELDS = ("right", "certified")
+"""Fields that the report reads."""
 ROPE_LENGTH = 1.0
 ROPE_LEVELS, CLOTH_LEVELS = (0.001, 0.002, 0.004), (0.0005, 0.001, 0.002)
 """Levels of noise, metres: on a rope of 1 m and a cloth of 0.3 m."""
@@ -154,9 +156,17 @@ def available_methods() -> tuple[str, ...]:
     return tuple(name for name in METHODS if name not in missing)
 
 
-def run_study(study: SimplificationStudy, folder: Path, console: Console) -> dict[str, Any]:
-    """Simplify the goals missing from the folder, and return the summary of all in it."""
-    rows = records.RowFile(folder / ROWS_FILE, IDENTITY)
+def run_study(
+    study: SimplificationStudy, folder: Path, console: Console, *, mixed: bool = False
+) -> dict[str, Any]:
+    """Simplify the goals missing from the folder, and return the summary of all in it.
+
+    Raises:
+        ResultsError: if the folder has rows of another environment, unless `mixed`.
+    """
+    environment = records.environment()
+    rows = records.RowFile(folder / ROWS_FILE, IDENTITY, FIELDS)
+    rows.resume(environment, mixed=mixed, tell=teller(console))
     todo = {
         (*asdict(case).values(), method): (case, method)
         for case in study.cases()
@@ -165,8 +175,8 @@ def run_study(study: SimplificationStudy, folder: Path, console: Console) -> dic
     left = [todo[key] for key in rows.left(todo)]
     with progress_bar(console) as progress:
         for case, method in progress.track(left, description="goals"):
-            rows.append(_row(case, case.make(), method))
-    return {"environment": records.environment(), "goals": rows.in_order(todo)}
+            rows.append(_row(case, case.make(), method) | {"environment": environment})
+    return {"environment": environment, "goals": rows.in_order(todo)}
 
 
 def _row(case: Case, ideal: IdealGoal, method: str) -> dict[str, Any]:
@@ -204,6 +214,8 @@ class SimplificationOptions:
     """Output folder (default: results/simplification, or results/simplification-smoke)."""
     smoke: bool = False
     """One resolution, one seed."""
+    mixed: bool = False
+    """Go on in a folder with rows of another environment; the report says so."""
 
     def configuration(self) -> SimplificationStudy:
         """The study of these options.
@@ -222,8 +234,8 @@ class SimplificationOptions:
     def run(self, console: Console) -> None:
         """Run the study."""
         study, folder = self.configuration(), self.out or default_folder(self.NAME, self.smoke)
-        records.open_folder(folder, study.identity())
-        from experiments.simplification_report import write_report
+        with records.open_folder(folder, study.identity()):
+            from experiments.simplification_report import write_report
 
-        write_report(study, run_study(study, folder, console), folder)
+            write_report(study, run_study(study, folder, console, mixed=self.mixed), folder)
         console.print(f"done: {folder}/report.md")

@@ -39,7 +39,7 @@ def write_report(study: SimplificationStudy, summary: dict[str, Any], folder: Pa
         save_figure(viz.plot_models(models), figures / f"models_{method}.png")
     errors = {name: found for name, (_, found) in _shown(study, study.methods[0]).items()}
     save_figure(viz.plot_model_errors(errors), figures / "errors.png")
-    (folder / "report.md").write_text(_report(study, summary))
+    records.write_text(folder / "report.md", _report(study, summary))
 
 
 def _shown(study: SimplificationStudy, method: str) -> dict[str, tuple[Any, KeyPoints]]:
@@ -159,7 +159,7 @@ def _report(study: SimplificationStudy, summary: dict[str, Any]) -> str:
         f"## Error by number of key points, method {study.methods[0]}",
         "![errors](figures/errors.png)",
         "",
-        *provenance(summary["environment"], f"Rows in `{ROWS_FILE}`"),
+        *provenance(rows, f"Rows in `{ROWS_FILE}`"),
     ]
     return "\n".join(lines) + "\n"
 

@@ -1,6 +1,7 @@
 """Common parts of studies: each is a dataclass of options with `run`, and a line in run.py."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -24,6 +25,11 @@ class StudyOptions(Protocol):
 def default_folder(name: str, smoke: bool) -> Path:
     """Default folder for the results of a study."""
     return Path("results") / (name + "-smoke" * smoke)
+
+
+def teller(console: Console) -> Callable[[str], None]:
+    """A function that prints a line as it is, whatever is in it."""
+    return lambda line: console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def told_done(console: Console, folder: Path, start: float) -> None:

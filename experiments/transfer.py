@@ -8,8 +8,9 @@ our dynamics; if neither do, the engines differ.
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -20,7 +21,7 @@ from experiments import plans
 from experiments.plan_options import PlanOptions
 from experiments.progress import progress_bar
 from experiments.scripted import SCRIPTS, scripted_plan
-from experiments.study import told_done
+from experiments.study import teller, told_done
 from jaxsimp import records
 from jaxsimp.engines import Execution, MassSprings, MuJoCo, replay
 from jaxsimp.engines.mujoco import VARIANTS
@@ -32,6 +33,11 @@ SCRIPTED = "scripted"
 """Name of the action space of hand-made plans."""
 SCRIPTED_SEEDS = 2
 """Number of seeds of the hand-made plans: a fold starts flat, and the seed sets its turn."""
+FIELDS = (
+    *("planning", "plan", "final_score", "warnings"),
+    *(f"mujoco_{name}_score" for name in VARIANTS),
+)
+"""Fields that the report reads."""
 
 
 @dataclass(frozen=True)
@@ -97,23 +103,67 @@ def planned_study(folder: Path) -> plans.PlanStudy:
     return plans.PlanStudy(**{**settings, **lists})
 
 
-def run_study(study: TransferStudy, folder: Path, console: Console) -> dict[str, Any]:
-    """Plan and replay the cases missing from the folder, and return the summary of all."""
+def run_study(
+    study: TransferStudy, folder: Path, console: Console, *, mixed: bool = False
+) -> dict[str, Any]:
+    """Plan and replay the cases missing from the folder, and return the summary of all.
+
+    Raises:
+        ResultsError: if the folder has rows of another environment, unless `mixed`; or a plan of
+            an earlier study is missing or damaged.
+    """
+    environment = records.environment()
+    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY, FIELDS)
+    rows.resume(environment, mixed=mixed, tell=teller(console))
     if study.source is None:
-        found, source = plans.run_study(study.plans, folder, console)["runs"], folder
+        found, source = plans.run_study(study.plans, folder, console, mixed=mixed)["runs"], folder
     else:
         source = Path(study.source)
-        found = records.read_rows(source / plans.ROWS_FILE)
+        found = _earlier_runs(study.plans, source)
     cases = [Case(_row_of_plan(row), source / row["plan"]) for row in found]
     cases += _scripted_cases(study, folder, console)
-    _replay_all(study, cases, folder, console)
-    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
+    fault = partial(_replay_fault, study, folder, {case.key: case for case in cases})
+    rows.resume(environment, mixed=mixed, fault=fault, tell=teller(console))
+    _replay_all(study, cases, rows, folder, environment, console)
     ordered = rows.in_order(case.key for case in cases)
     return {
-        "environment": records.environment(),
+        "environment": environment,
         "transfer": [row for row in ordered if row["action_space"] != SCRIPTED],
         "scripted": [row for row in ordered if row["action_space"] == SCRIPTED],
     }
+
+
+def _earlier_runs(study: plans.PlanStudy, source: Path) -> list[dict[str, Any]]:
+    """The runs of an earlier study whose plans are whole.
+
+    Raises:
+        ResultsError: if a row or a plan is damaged.
+    """
+    rows = plans.row_file(source)
+    by_key = {rows.key(row): row for row in rows.rows()}
+    found = [by_key[run] for run in plans.all_runs(study) if run in by_key]
+    tasks = {name: study.task(name) for name in study.tasks}
+    for row in found:
+        if fault := plans.run_fault(tasks, source, row):
+            raise records.ResultsError(f"{fault}; run its study again, which makes it again")
+    return found
+
+
+def _replay_fault(
+    study: TransferStudy, folder: Path, cases: dict[tuple[Any, ...], Case], row: dict[str, Any]
+) -> str | None:
+    """What is wrong with the replays of a row, whose files are set aside then; or None."""
+    case = cases.get(tuple(row[name] for name in plans.IDENTITY))
+    if case is None:
+        return None
+    if any(row.get(name) != value for name, value in case.row.items()):
+        return f"{folder / ROWS_FILE}: the replay of {row['plan']!r} is of another plan"
+    task = study.plans.task(row["task"])
+    for variant in VARIANTS:
+        path, score = replay_path(folder, row, variant), row[f"mujoco_{variant}_score"]
+        if fault := plans.set_plan_aside(path, plans.plan_fault(path, task, (score,))):
+            return fault
+    return None
 
 
 def _row_of_plan(row: dict[str, Any]) -> dict[str, Any]:
@@ -130,7 +180,10 @@ def _scripted_cases(study: TransferStudy, folder: Path, console: Console) -> lis
         path = folder / plans.PLANS_FOLDER / f"{name}-{SCRIPTED}-{seed}.npz"
         task = study.plans.task(name)
         episode = task.episode_fn(seed)
-        if not path.exists():
+        fault = plans.plan_fault(path, task)
+        if fault and path.exists():
+            teller(console)(f"{plans.set_plan_aside(path, fault)}; it is made again")
+        if fault:
             if name not in executors:
                 console.print(f"{name}: plans made by hand")
                 executors[name] = MassSprings(study.plans.self_contact).executor(task)
@@ -153,10 +206,16 @@ def _scripted_cases(study: TransferStudy, folder: Path, console: Console) -> lis
     return cases
 
 
-def _replay_all(study: TransferStudy, cases: list[Case], folder: Path, console: Console) -> None:
+def _replay_all(
+    study: TransferStudy,
+    cases: list[Case],
+    rows: records.RowFile,
+    folder: Path,
+    environment: dict[str, Any],
+    console: Console,
+) -> None:
     """Replay the cases without a row, task by task."""
     (folder / REPLAYS_FOLDER).mkdir(exist_ok=True)
-    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY)
     todo = set(rows.left(case.key for case in cases))
     left = [case for case in cases if case.key in todo]
     with progress_bar(console) as progress:
@@ -165,7 +224,7 @@ def _replay_all(study: TransferStudy, cases: list[Case], folder: Path, console: 
             task = study.plans.task(name)
             of_task = [case for case in left if case.row["task"] == name]
             for row in _replay_task(task, of_task, folder) if of_task else ():
-                rows.append(row)
+                rows.append(row | {"environment": environment})
                 progress.advance(bar)
 
 
@@ -239,22 +298,39 @@ class TransferOptions(PlanOptions):
             super().run(console)
             return
         study, folder = self.transfer(), self.folder()
-        records.open_folder(folder, study.identity())
-        from experiments.transfer_report import write_report
-
         start = time.perf_counter()
-        summary = run_study(study, folder, console)
-        write_report(study, summary, folder)
-        if self.plans:
-            _add_to_report(study, summary, self.plans)
+        with records.open_folder(folder, study.identity()):
+            from experiments.transfer_report import write_report
+
+            summary = run_study(study, folder, console, mixed=self.mixed)
+            write_report(study, summary, folder)
+            if self.plans:
+                _add_to_report(study, summary, self.plans, teller(console))
         told_done(console, folder, start)
 
 
-def _add_to_report(study: TransferStudy, summary: dict[str, Any], source: Path) -> None:
-    """Add columns on transfer to the report of the study of the plans."""
+def _add_to_report(
+    study: TransferStudy, summary: dict[str, Any], source: Path, tell: Callable[[str], None]
+) -> None:
+    """Add columns on transfer to the report of the study of the plans.
+
+    Raises:
+        ResultsError: if another process holds the folder of that study.
+    """
     from experiments import plan_report
 
-    records.write_json(source / plan_report.TRANSFER_FILE, summary["transfer"])
-    path = source / plan_report.SUMMARY_FILE
-    if path.exists():
-        plan_report.write_report(study.plans, json.loads(path.read_text()), source)
+    with records.lock_folder(source):
+        records.write_json(source / plan_report.TRANSFER_FILE, summary["transfer"])
+        path = source / plan_report.SUMMARY_FILE
+        if not path.exists():
+            return
+        try:
+            earlier = json.loads(path.read_text())
+            earlier["runs"], earlier["models"]
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            tell(
+                f"{path} is damaged ({type(error).__name__}: {error}), and its report is left as "
+                f"it is; run the study of these plans again, which makes both again"
+            )
+            return
+        plan_report.write_report(study.plans, earlier, source, tell)

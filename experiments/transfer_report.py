@@ -35,7 +35,7 @@ def write_report(study: TransferStudy, summary: dict[str, Any], folder: Path) ->
         for task in study.plans.tasks
         for name, row in _shown(_of(rows, task=task)).items()
     ]
-    (folder / "report.md").write_text(_report(study, summary, pictures))
+    records.write_text(folder / "report.md", _report(study, summary, pictures))
 
 
 def _of(rows: Rows, **fields: Any) -> Rows:
@@ -114,7 +114,7 @@ def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) 
         *(f"![{Path(file).stem}](figures/{file})" for file in pictures),
         "",
         *provenance(
-            summary["environment"],
+            [*summary["transfer"], *summary["scripted"]],
             f"Rows in `{ROWS_FILE}`, plans in `{PLANS_FOLDER}/`, their motions in MuJoCo in "
             f"`{REPLAYS_FOLDER}/`",
         ),

@@ -17,6 +17,7 @@ from experiments.physics import (
     swings,
     two_sheets,
 )
+from jaxsimp import records
 from jaxsimp.cli.status import exit_status
 
 if TYPE_CHECKING:
@@ -86,10 +87,11 @@ def save_small(figure: "Figure", path: Path) -> None:
     """Write a figure as PNG of at most 128 colors: a third of the size with all colors."""
     from PIL import Image
 
-    figure.savefig(path, dpi=110)
-    with Image.open(path) as picture:
-        few = picture.convert("RGB").quantize(128)
-    few.save(path, optimize=True)
+    with records.whole_file(path) as part:
+        figure.savefig(part, dpi=110)
+        with Image.open(part) as picture:
+            few = picture.convert("RGB").quantize(128)
+        few.save(part, optimize=True)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-import tyro
-
 import jaxsimp
 from jaxsimp.cli.status import exit_status
 
@@ -26,12 +24,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: that of the verb, 2 for wrong input, 130 for Ctrl-C.
     """
+    return exit_status(lambda: _run(arguments))
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
         print(f"jaxsimp {jaxsimp.__version__}")
         return 0
-    options = parse(given)
-    return exit_status(options.run)
+    return int(parse(given).run())
 
 
 def parse(arguments: Sequence[str]) -> Any:
@@ -40,6 +41,8 @@ def parse(arguments: Sequence[str]) -> Any:
     Raises:
         SystemExit: if they are invalid (status 2), or request help (status 0).
     """
+    import tyro  # late, as are the verbs: a signal meanwhile is told, too
+
     app = tyro.extras.SubcommandApp()
     named = bool(arguments) and arguments[0] in VERBS
     for verb in VERBS:

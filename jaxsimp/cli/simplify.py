@@ -281,5 +281,6 @@ def save_figure(models: list[SimplifiedGoal], path: Path) -> None:
         for stem, model in zip(stems, models, strict=True)
     }
     figure = jaxsimp.viz.plot_simplifications(shown)
-    figure.savefig(path, dpi=150)
+    with jaxsimp.records.whole_file(path) as part:
+        figure.savefig(part, dpi=150)
     plt.close(figure)

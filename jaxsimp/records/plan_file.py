@@ -8,7 +8,6 @@ under `body/`, and one JSON text, `about`: task, engine, score and environment. 
 import dataclasses
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -24,6 +23,7 @@ from jaxsimp.bodies import Body, Material
 from jaxsimp.dynamics import Actions, Obstacle
 from jaxsimp.dynamics.contact.obstacles import SHAPES
 from jaxsimp.engines import Execution
+from jaxsimp.records.files import whole_file
 from jaxsimp.records.provenance import environment
 from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, task_names
 
@@ -163,9 +163,8 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 def _write_whole(path: Path, arrays: Mapping[str, Any]) -> None:
     written = io.BytesIO()
     np.savez_compressed(written, **arrays)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(written.getvalue())
-    os.replace(part, path)
+    with whole_file(path) as part:
+        part.write_bytes(written.getvalue())
 
 
 def _task_text(task: Task) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Provenance: the environment that results depend on, besides their configuration."""
 
 import importlib.metadata
+import os
 import platform
 import subprocess
 from pathlib import Path
@@ -22,10 +23,19 @@ PACKAGES = (
     "proxsuite",
     "mujoco",
 )
+SETTINGS = (
+    "jax_enable_x64",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_random_seed_offset",
+    "jax_default_matmul_precision",
+    "jax_disable_most_optimizations",
+)
+"""Settings of JAX that change what is computed."""
 
 
 def environment() -> dict[str, Any]:
-    """Versions, commit, device and cores, on which results depend besides their configuration."""
+    """What results depend on besides their configuration: versions, commit, machine, settings."""
     device = jax.devices()[0]
     return {
         "python": platform.python_version(),
@@ -37,7 +47,14 @@ def environment() -> dict[str, Any]:
         "device": device.device_kind,
         "num_devices": jax.device_count(),
         "x64": jnp.result_type(float) == jnp.float64,
+        "settings": {name: _setting(name) for name in SETTINGS}
+        | {"XLA_FLAGS": " ".join(os.environ.get("XLA_FLAGS", "").split())},
     }
+
+
+def _setting(name: str) -> Any:
+    """A setting of JAX, here and now; not every one is an attribute."""
+    return getattr(jax.config, name, jax.config.values.get(name))
 
 
 def _version(package: str) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
 from importlib import import_module
@@ -118,3 +119,96 @@ def test_an_interrupted_command_says_so(capsys):
 
     assert exit_status(run, "stopped; go on with the same command") == INTERRUPTED == 130
     assert capsys.readouterr().out == "\nstopped; go on with the same command\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (OSError(28, "No space left on device", "a/[b].npz"), "No space left on device: a/[b].npz"),
+        (OSError(5, "Input/output error"), "Input/output error"),
+        (OSError("encoder error"), "encoder error"),
+    ],
+)
+def test_an_error_of_the_machine_is_one_line_and_says_how_to_go_on(error, told, capsys):
+    def run():
+        raise error
+
+    assert exit_status(run, again="once that is cured, try again") == REFUSED
+    assert capsys.readouterr().err == f"error: {told}; once that is cured, try again\n"
+
+
+SLEEPING = """
+import signal, sys, time
+from jaxsimp.cli.status import exit_status
+def run():
+    try:
+        print("started", flush=True)
+        time.sleep(60)
+    finally:
+        {last}
+{first}
+sys.exit(exit_status(run, "stopped; go on with the same command"))
+"""
+
+
+def signalled(number, first="", last="print('put away', flush=True)", times=1):
+    """Exit status, output and errors of a command that is sent a signal at work."""
+    with subprocess.Popen(
+        [sys.executable, "-c", SLEEPING.format(first=first, last=last)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        told = ""
+        for _ in range(times):
+            told += process.stdout.readline()
+            process.send_signal(number)
+        out, error = process.communicate()
+    return process.returncode, told + out, error
+
+
+@pytest.mark.parametrize("name", ["INT", "TERM", "HUP"])
+def test_a_signal_ends_a_command_in_order(name):
+    number = signal.Signals[f"SIG{name}"]
+    told = "started\nput away\n\nstopped; go on with the same command\n"
+    assert signalled(number) == (128 + number, told, "")
+
+
+def test_a_second_signal_ends_a_command_at_once():
+    last = "print('putting away', flush=True); time.sleep(60)"
+    status, told, error = signalled(signal.SIGINT, last=last, times=2)
+    assert (status, told, error) == (-signal.SIGINT, "started\nputting away\n", "")
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    # As by nohup: the command goes on, here to the signal after it.
+    first = "signal.signal(signal.SIGHUP, signal.SIG_IGN)"
+    script = "signal.raise_signal(signal.SIGHUP); signal.raise_signal(signal.SIGTERM)"
+    code = SLEEPING.format(first=first, last="pass").replace("time.sleep(60)", script)
+    done = python("-c", code)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGTERM, "")
+
+
+def test_handlers_of_signals_are_put_back():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    during = []
+    exit_status(lambda: during.append(signal.getsignal(signal.SIGTERM)) or 0)
+    assert before == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert during[0] not in before
+
+
+@pytest.mark.parametrize("command", [("jaxsimp", "simplify", "a.npz"), ("experiments.run",)])
+@pytest.mark.parametrize("name", ["INT", "TERM"])
+def test_a_signal_during_the_imports_leaves_no_traceback(tmp_path, command, name):
+    number = signal.Signals[f"SIG{name}"]
+    (tmp_path / "tyro.py").write_text(f"import signal; signal.raise_signal({int(number)})\n")
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (128 + number, "")
+    assert "interrupted" in done.stdout

@@ -14,6 +14,9 @@ import numpy as np
 import pytest
 
 from experiments import plan_options, plan_report, plans, run
+from experiments.goals import GoalsOptions
+from experiments.paper import PaperOptions
+from jaxsimp import records
 from jaxsimp.planning import CEM, ENCODINGS
 from jaxsimp.records import load_plan
 from jaxsimp.tasks import make_task, score
@@ -215,8 +218,83 @@ def test_a_killed_process_goes_on_to_the_same_runs(folder, tmp_path):
     assert untimed(finished(out)["runs"]) == untimed(finished(folder)["runs"])
 
 
+@pytest.mark.slow
+def test_damage_is_told_set_aside_and_made_again(folder, tmp_path, capsys):
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    rows = [json.loads(line) for line in (copy / "runs.jsonl").read_text().splitlines()]
+    missing, damaged, other, swapped = (copy / row["plan"] for row in rows[:4])
+    missing.unlink()
+    damaged.write_bytes(b"no plan")
+    shutil.copy(copy / rows[-1]["plan"], other)  # of another shape: a cloth's
+    shutil.copy(folder / rows[2]["plan"], swapped)  # of the same shape, with another score
+    with (copy / "runs.jsonl").open("a") as file:
+        file.write(json.dumps(rows[5]) + "\n\n")
+    assert command(*OPTIONS, "--out", copy) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "runs.jsonl, line 10 is no row of results, it is blank; the file is kept as" in told
+    assert f"{missing} is missing; it is made again" in told
+    assert f"{damaged} cannot be read" in told
+    assert f"{other} has positions of shape (3, 81, 3)" in told
+    assert f"{swapped} has another score than its row (kept as {swapped.name}.damaged-1)" in told
+    assert untimed(finished(copy)["runs"]) == untimed(finished(folder)["runs"])
+    for row in rows:
+        assert (copy / row["plan"]).read_bytes() == (folder / row["plan"]).read_bytes()
+    kept = [path.name for path in copy.rglob("*.damaged-*")]
+    assert sorted(kept) == sorted(
+        ["runs.jsonl.damaged-1", *(f"{path.name}.damaged-1" for path in (damaged, other, swapped))]
+    )
+
+
+@pytest.mark.slow
+def test_another_environment_is_refused_or_told_in_the_report(
+    folder, tmp_path, capsys, monkeypatch
+):
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    before = (copy / "runs.jsonl").read_bytes()
+    (copy / "runs.jsonl").write_bytes(before.replace(b'"cores": ', b'"cores": 1', 1))
+    assert command(*OPTIONS, "--out", copy) == 2
+    assert "has rows of another environment: cores differ (cores: 1" in capsys.readouterr().err
+    assert command(*OPTIONS, "--out", copy, "--mixed") == 0
+    report = (copy / "report.md").read_text()
+    assert "**The rows are of 2 environments (`--mixed`)**" in report
+    assert "\n- 1 rows: Commit" in report
+    assert "\n- 7 rows: Commit" in report
+    assert "(`--mixed`)" not in (folder / "report.md").read_text()
+
+
+def test_a_study_that_is_running_is_not_run_a_second_time(tmp_path, capsys):
+    study = PaperOptions(tasks=("rope_folding",), resolution=9).configuration()
+    options = ("--tasks", "rope_folding", "--resolution", "9")
+    with records.open_folder(tmp_path / "new", study.identity()):
+        assert command(*options, "--out", tmp_path / "new") == 2
+    assert f"is in use by process {os.getpid()}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damaged", ["", "[1]", '[{"task": "t"}]', "{}{", "\x00"])
+def test_damaged_replays_are_told_and_left_out(tmp_path, damaged):
+    (tmp_path / "transfer.json").write_text(damaged)
+    told = []
+    assert plan_report._replayed(tmp_path, told.append) == []
+    assert f"{tmp_path / 'transfer.json'} is damaged" in told[0]
+    assert f"`python -m experiments.run transfer --plans {tmp_path}` makes it again" in told[0]
+    assert (tmp_path / "transfer.json.damaged-1").read_text() == damaged
+    assert not (tmp_path / "transfer.json").exists()
+
+
+def test_a_full_disk_is_one_line_that_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+    def full(*args, **options):
+        raise OSError(28, "No space left on device", "plans/a.npz")
+
+    monkeypatch.setattr(plan_options, "run_study", full)
+    assert command(*OPTIONS, "--out", tmp_path / "new") == 2
+    assert capsys.readouterr().err == (
+        "error: No space left on device: plans/a.npz; once that is cured, the same command "
+        "resumes it\n"
+    )
+
+
 def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch, capsys):
-    def interrupt(*args):
+    def interrupt(*args, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(plan_options, "run_study", interrupt)
@@ -310,7 +388,7 @@ def test_list_names_everything(capsys):
 
 
 def test_options_replace_the_settings_of_the_budget():
-    study = run.PaperOptions(
+    study = PaperOptions(
         budget="paper", population=11, smoothing=0.3, keep_best=True, returns="best", num_actions=3
     ).configuration()
     task = study.task("rope_folding")
@@ -329,7 +407,7 @@ def test_options_replace_the_settings_of_the_budget():
 
 
 def test_the_papers_study_compares_both_of_its_encodings():
-    runs = list(run.PaperOptions(seeds=1).configuration().runs("rope_folding"))
+    runs = list(PaperOptions(seeds=1).configuration().runs("rope_folding"))
     encodings = ("categorical", "gaussian_index")
     assert runs == [(space, each, 0) for space in plans.ACTION_SPACES for each in encodings]
 
@@ -337,7 +415,7 @@ def test_the_papers_study_compares_both_of_its_encodings():
 def test_the_paper_budget_is_the_authors():
     # Figures of the author's runs: horizon 15, 0.08 m an axis a step; 70 and 333 plans a round
     # of 20, a tenth of them elites, no smoothing, variance 0.5, the mean returned.
-    study = run.PaperOptions(budget="paper").configuration()
+    study = PaperOptions(budget="paper").configuration()
     for name, population, elites in [
         ("rope_straightening", 70, 7),
         ("cloth_side_folding", 333, 33),
@@ -353,13 +431,13 @@ def test_the_paper_budget_is_the_authors():
 
 def test_studies_that_plan_otherwise_have_another_folder():
     for planning, name in (("nominal", "goals"), ("mixed", "goals-mixed")):
-        options = run.GoalsOptions(planning=planning)
+        options = GoalsOptions(planning=planning)
         assert options.folder().name == name
         assert options.configuration().planning == planning
 
 
 def test_a_smoke_run_is_small():
-    study = run.PaperOptions(smoke=True).configuration()
+    study = PaperOptions(smoke=True).configuration()
     assert study.seeds == 2
     assert study.task("cloth_side_folding").body.num_particles == 81
-    assert run.PaperOptions(smoke=True).folder() != run.PaperOptions().folder()
+    assert PaperOptions(smoke=True).folder() != PaperOptions().folder()

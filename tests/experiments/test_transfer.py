@@ -17,7 +17,7 @@ from experiments.transfer import planned_study, replay_path
 from jaxsimp.engines import Execution, MassSprings, make_ensemble
 from jaxsimp.engines.mujoco.model import VARIANTS
 from jaxsimp.planning import Planner
-from jaxsimp.records import load_plan, read_rows, save_plan
+from jaxsimp.records import load_plan, lock, read_rows, save_plan
 from jaxsimp.tasks import make_task, score, task_names
 
 TASKS = ("rope_straightening", "cloth_diagonal_folding")
@@ -144,6 +144,58 @@ def test_plans_of_an_earlier_study_are_replayed(folder, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_pictures")
+def test_damaged_plans_and_replays_are_made_again(folder, tmp_path, capsys):
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    found, by_hand = finished(folder)["transfer"], finished(folder)["scripted"]
+    (copy / by_hand[0]["plan"]).write_bytes(b"no plan")
+    replay_path(copy, found[0], "fast").unlink()
+    replay_path(copy, found[1], "full").write_bytes(b"no plan")
+    with (copy / "replays.jsonl").open("a") as file:
+        file.write("!!\n")
+    assert command(*OPTIONS, "--out", copy) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "replays.jsonl, line 5 is no row of results, it is no JSON: b'!!'" in told
+    assert told.count("is made again") == 4
+    assert finished(copy)["transfer"] == found
+    assert finished(copy)["scripted"] == by_hand
+    for row in [*found, *by_hand]:
+        paths = [Path(row["plan"]), *(replay_path(Path(), row, name) for name in VARIANTS)]
+        for path in paths:
+            assert (copy / path).read_bytes() == (folder / path).read_bytes()
+
+
+@pytest.mark.slow
+def test_earlier_plans_that_are_damaged_are_refused(folder, tmp_path):
+    source = Path(shutil.copytree(folder, tmp_path / "paper"))
+    study = transfer.TransferOptions(tasks=TASKS, seeds=1, resolution=7, num_actions=1)
+    planned = study.transfer().plans
+    first = transfer._earlier_runs(planned, source)[0]
+    (source / "runs.jsonl").write_text((source / "runs.jsonl").read_text() * 2)
+    assert len(transfer._earlier_runs(planned, source)) == len(TASKS)  # each once
+    (source / first["plan"]).unlink()
+    with pytest.raises(ValueError, match=r"npz is missing; run its study again"):
+        transfer._earlier_runs(planned, source)
+
+
+def test_the_folder_of_the_plans_is_left_while_it_is_in_use(tmp_path, monkeypatch):
+    monkeypatch.setattr(lock, "PATIENCE", 0.0)
+    with lock.lock_folder(tmp_path), pytest.raises(ValueError, match="in use by process"):
+        transfer._add_to_report(None, {"transfer": []}, tmp_path, print)
+    assert not (tmp_path / "transfer.json").exists()
+
+
+@pytest.mark.parametrize("damaged", ["", "[]", '{"runs": []}'])
+def test_a_damaged_summary_of_the_plans_is_told(tmp_path, damaged):
+    (tmp_path / "summary.json").write_text(damaged)
+    told = []
+    transfer._add_to_report(None, {"transfer": []}, tmp_path, told.append)
+    assert "summary.json is damaged" in told[0]
+    assert "run the study of these plans again" in told[0]
+    assert (tmp_path / "transfer.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_pictures")
 def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
     options = (*OPTIONS, "--tasks", "rope_folding", "--planning", "robust")
     out = tmp_path / "robust"
@@ -166,7 +218,7 @@ def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
 
 def test_what_judges_plans_is_part_of_what_a_study_is():
     options = [
-        run.TransferOptions(smoke=True, planning=each)
+        transfer.TransferOptions(smoke=True, planning=each)
         for each in ("nominal", "robust", "self_contact", "mixed")
     ]
     nominal, robust, touching = (each.transfer().identity()["plans"] for each in options[:3])
