@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxsimp.bodies import Body, from_mesh, rope_along
-from jaxsimp.bodies.meshes import load_mesh, read_mesh
+from jaxsimp.bodies.mesh_files import load_mesh, read_mesh
 from jaxsimp.goals.check import check_goal
 from jaxsimp.goals.flatten import flatten
 from jaxsimp.goals.shapes import Positions

@@ -11,7 +11,8 @@ with a decreasing scale).
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.meshes import LARGEST, WELD
+from jaxsimp.bodies.meshes import WELD
+from jaxsimp.bodies.size import LARGEST
 from jaxsimp.bodies.topology import (
     Faces,
     connected_pieces,

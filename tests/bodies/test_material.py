@@ -26,14 +26,14 @@ def strip(**options):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", [-0.5, NAN, INF])
 def test_a_value_that_no_material_has_is_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} is {value:g}; give a finite number"):
+    with pytest.raises(ValueError, match=f"{name} is {value}; give a number from .* to "):
         MATERIALS["cloth"].changed(**{name: value})
 
 
 def test_zero_is_refused_as_a_density_only():
     for name in NAMES[1:]:
         assert getattr(MATERIALS["cloth"].changed(**{name: 0.0}), name) == 0.0
-    with pytest.raises(ValueError, match="density is 0; give a finite number above zero"):
+    with pytest.raises(ValueError, match="density is 0.0; give a number from 1e-06 to"):
         MATERIALS["cloth"].changed(density=0.0)
 
 
