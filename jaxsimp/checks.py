@@ -102,9 +102,7 @@ def require_ids(name: str, values: object, count: int, of: str = "particles") ->
     if wrong.size and not count:
         raise ValueError(f"{name} names {wrong[0]}, and there are no {of}; give them first")
     if wrong.size:
-        raise ValueError(
-            f"{name} names {wrong[0]}; the ids of {count} {of} are 0 to {count - 1}"
-        )
+        raise ValueError(f"{name} names {wrong[0]}; the ids of {count} {of} are 0 to {count - 1}")
     return array
 
 

@@ -3,6 +3,8 @@
 Each takes a material, by default that of its kind in `MATERIALS`, and changes of single parameters.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -181,11 +183,10 @@ def from_mesh(
 
 
 def _two(name: str, values: object) -> tuple[object, object]:
-    try:
-        first, second = values  # type: ignore[misc]  # anything else is refused here
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} is {values!r}; give two numbers, along x and along y") from None
-    return first, second
+    both = tuple(values) if isinstance(values, Iterable) else ()
+    if len(both) != 2:
+        raise ValueError(f"{name} is {values!r}; give two numbers, along x and along y")
+    return both
 
 
 def _weigh(

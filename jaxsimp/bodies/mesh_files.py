@@ -8,6 +8,7 @@ import re
 import warnings
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ CONVERT = {
 ARCHIVES = (".zip", ".gz", ".bz2", ".xz", ".tar", ".7z", ".tgz", ".3mf")
 
 
-class _Unreadable(ValueError):
+class _UnreadableError(ValueError):
     """What is wrong with a file, without its path."""
 
 
@@ -73,7 +74,9 @@ def read_mesh(path: str | Path) -> Mesh:
         else:
             points, faces = _read_with_trimesh(data, Path(path))
         if not faces.size:
-            raise _Unreadable("it has no triangles; give a file with the triangles of a surface")
+            raise _UnreadableError(
+                "it has no triangles; give a file with the triangles of a surface"
+            )
         return as_mesh(points, faces)
     except ValueError as error:
         raise ValueError(f"{path} cannot be read as a mesh: {error}") from error
@@ -112,7 +115,7 @@ def read_file(path: str | Path, wanted: str) -> bytes:
 def _read_obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Points and triangles of an OBJ file, whatever materials, groups and textures it has."""
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        raise _Unreadable("it is in UTF-16; save it as UTF-8")
+        raise _UnreadableError("it is in UTF-16; save it as UTF-8")
     points: list[list[float]] = []
     polygons: list[list[int]] = []
     text = re.sub(rb"\\\r?\n", b" ", data.removeprefix(b"\xef\xbb\xbf"))
@@ -126,13 +129,15 @@ def _read_obj(data: bytes) -> tuple[np.ndarray, np.ndarray]:
                 polygons.append(_corners(rest, len(points)))
         except ValueError as error:
             told = line.decode("latin-1").strip()[:60]
-            raise _Unreadable(
+            raise _UnreadableError(
                 f"line {number} is {told!r}; give a point as 'v x y z', a triangle as 'f 1 2 3'"
             ) from error
         if len(points) > MOST_PARTICLES:
-            raise _Unreadable(f"it has more than {MOST_PARTICLES} points, the limit: decimate it")
+            raise _UnreadableError(
+                f"it has more than {MOST_PARTICLES} points, the limit: decimate it"
+            )
     if not points:
-        raise _Unreadable(f"it has no points ('v x y z'), or is no OBJ file; give {FORMATS}")
+        raise _UnreadableError(f"it has no points ('v x y z'), or is no OBJ file; give {FORMATS}")
     return np.array(points), _triangles(polygons)
 
 
@@ -151,9 +156,9 @@ def _triangles(polygons: list[list[int]]) -> np.ndarray:
     if {len(polygon) for polygon in polygons} == {4}:
         return np.asarray(triangulate_quads(polygons))
     fans = [
-        [polygon[0], *pair]
+        [polygon[0], *polygon[place : place + 2]]
         for polygon in polygons
-        for pair in zip(polygon[1:-1], polygon[2:], strict=True)
+        for place in range(1, len(polygon) - 1)
     ]
     return np.array(fans, dtype=np.int64).reshape(-1, 3)
 
@@ -164,33 +169,31 @@ def _read_with_trimesh(data: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]
 
     suffix = path.suffix.lower()
     if suffix in CONVERT:
-        raise _Unreadable(
+        raise _UnreadableError(
             f"{CONVERT[suffix]} is not read; give an OBJ or PLY file, which Blender, for one, "
             f"exports"
         )
     if suffix in ARCHIVES:
-        raise _Unreadable(f"it is an archive; unpack it, and give {FORMATS}")
+        raise _UnreadableError(f"it is an archive; unpack it, and give {FORMATS}")
     kind = suffix[1:]
     if kind not in trimesh.available_formats():
-        raise _Unreadable(f"{suffix or 'a name without suffix'} is no mesh format; give {FORMATS}")
+        raise _UnreadableError(
+            f"{suffix or 'a name without suffix'} is no mesh format; give {FORMATS}"
+        )
     # Each option that would reorder, split or merge points is off.
-    options: dict[str, bool] = {"process": False, "fix_texture": False, "skip_materials": True}
+    options: dict[str, Any] = {"process": False, "fix_texture": False, "skip_materials": True}
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             beside = trimesh.resolvers.FilePathResolver(str(path))
             file = BytesIO(_in_ascii(data, kind))
             scene = trimesh.load_scene(file, file_type=kind, resolver=beside, **options)
-            parts = scene.dump()
-            return _joined([(np.array(p.vertices), np.array(p.faces)) for p in parts if _is_mesh(p)])
+            parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+            return _joined([(np.array(part.vertices), np.array(part.faces)) for part in parts])
     except Exception as error:  # the readers raise many kinds of errors on a broken file
-        raise _Unreadable(
+        raise _UnreadableError(
             f"it is damaged, or is no {kind.upper()} file; export it again, or give {FORMATS}"
         ) from error
-
-
-def _is_mesh(part: object) -> bool:
-    return len(getattr(part, "faces", ())) > 0
 
 
 def _in_ascii(data: bytes, kind: str) -> bytes:

@@ -9,10 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.bodies.size import (
-    LARGEST,
     MOST_PARTICLES,
     MOST_TRIANGLES,
-    SMALLEST,
     require_scale,
     require_size,
 )
@@ -36,6 +34,8 @@ WELD = 1e-5
 which a triangle is empty. Above the rounding of a float32 file, below any triangle of a cloth."""
 FLAT = 1e-3
 """Largest height of a flat mesh, relative to its extent."""
+
+
 def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
     """One orientable surface in metres, from a mesh that may have faults.
 
@@ -50,9 +50,9 @@ def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
         scale: metres in one unit of `points`.
 
     Raises:
-        ValueError: if ids or coordinates are invalid, no triangle remains, the extent is outside
-            `SMALLEST` to `LARGEST` (see `jaxsimp.bodies.size`), an edge has more than two triangles, the mesh is in several
-            pieces, or it has one side only.
+        ValueError: if ids or coordinates are invalid, no triangle remains, the extent is that
+            of no body (see `jaxsimp.bodies.size`), an edge has more than two triangles, the mesh is
+            in several pieces, or it has one side only.
     """
     scale = require_scale(scale)
     points, faces = as_mesh(points, faces)

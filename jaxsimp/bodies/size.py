@@ -11,8 +11,6 @@ MOST_PARTICLES = 250_000
 MOST_TRIANGLES = 2 * MOST_PARTICLES
 """Largest number of triangles of a mesh: a sheet has two a particle."""
 UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254))
-COMMON = 0.1, 2.0
-"""Extent of most bodies, metres: a unit that leads to it is the guess."""
 
 
 def require_size(what: str, extent: object, *, smallest: float = SMALLEST) -> float:
@@ -37,9 +35,14 @@ def require_size(what: str, extent: object, *, smallest: float = SMALLEST) -> fl
     return float(number)
 
 
-def unit_of(extent: float) -> str:
-    """A guess of the unit in which a body of the usual size has this extent, as a remedy."""
-    low, high = COMMON
+def unit_of(extent: float, low: float = 0.1, high: float = 2.0) -> str:
+    """A guess of the unit, as a remedy: one in which an extent is in some limits.
+
+    Args:
+        extent: what was given.
+        low: lowest extent of the usual body, metres.
+        high: highest extent of the usual body, metres.
+    """
     for name, scale in UNITS:
         if low <= extent * scale <= high:
             return f"{name}? scale={scale:g}, or multiply by {scale:g}"

@@ -72,6 +72,8 @@ class KeyPoints:
         return self.errors[self.sizes.index(len(self))]
 
 
+SMALLEST_TOLERANCE = 1e-9
+"""Smallest tolerance, metres: below it rounding decides."""
 SIZES_BEYOND = 3
 """Number of sizes tried after the first that fits."""
 

@@ -142,7 +142,9 @@ def test_a_rope_along_points_is_at_rest_there(num_particles, seed):
 def test_a_rope_along_points_refuses_too_few_and_coinciding_ones():
     with pytest.raises(ValueError, match="num_particles is 1; give a whole number from 2"):
         rope_along(np.zeros((1, 3)))
-    with pytest.raises(ValueError, match=r"particles 0 and 1 of the rope are at the same place \(2 such"):
+    with pytest.raises(
+        ValueError, match=r"particles 0 and 1 of the rope are at the same place \(2 such"
+    ):
         rope_along(np.zeros((3, 3)))
     with pytest.raises(ValueError, match=r"points\[\d\] is .*give finite numbers, in m"):
         rope_along(np.array([[0.0, 0.0, 0.0], [0.1, np.nan, 0.0]]))
@@ -408,10 +410,16 @@ def test_a_cloth_refuses(arguments, message):
         ({"rest": np.zeros((0, 3))}, "num_particles is 0; give a whole number from 1"),
         ({"rest": np.full((3, 3), NAN)}, r"rest\[0, 0\] is nan; give numbers"),
         ({"mass": np.ones(4)}, r"mass has shape \(4,\); \(3,\) is needed"),
-        ({"mass": np.array([1.0, 0.0, 1.0])}, r"mass\[1\] is 0; give numbers from 1e-12 to 1000 kg"),
+        (
+            {"mass": np.array([1.0, 0.0, 1.0])},
+            r"mass\[1\] is 0; give numbers from 1e-12 to 1000 kg",
+        ),
         ({"mass": np.array([1.0, INF, 1.0])}, r"mass\[1\] is inf"),
         ({"springs": np.zeros((3, 3), dtype=int)}, r"springs has shape \(3, 3\); \(3, 2\)"),
-        ({"springs": np.array([[0, 1], [1, 2], [0, 3]])}, "springs names 3; the ids of 3 particles are 0"),
+        (
+            {"springs": np.array([[0, 1], [1, 2], [0, 3]])},
+            "springs names 3; the ids of 3 particles are 0",
+        ),
         ({"springs": np.array([[0, 1], [1, 2], [0, -1]])}, "springs names -1"),
         ({"springs": np.array([[0, 1], [1, 2], [2, 2]])}, r"spring \[2, 2\] joins a particle to"),
         ({"springs": np.array([[0, 1], [1, 2], [1, 0]])}, r"spring \[0, 1\] is there twice"),

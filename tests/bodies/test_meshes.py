@@ -276,7 +276,7 @@ def test_a_strip_with_a_half_turn_is_refused_and_with_two_is_not():
         (SQUARE * 0, TWO, "every triangle is empty"),
         (np.where(SQUARE == 1, NAN, SQUARE), TWO, r"3 points .* not finite, the first is \[nan"),
         (SQUARE - np.inf, TWO, "points of triangles are not finite"),
-        (SQUARE * 300, TWO, r"is 300 m; a body is 0\.01 to 5 m.*millimetres\? scale=0\.001, or multiply by"),
+        (SQUARE * 300, TWO, r"is 300 m; a body is 0\.01 to 5 m.*millimetres\? scale=0\.001, or"),
         (SQUARE * 60, TWO, r"centimetres\? scale=0\.01,"),
         (SQUARE * 7, TWO, r"inches\? scale=0\.0254"),
         (SQUARE * 1e6, TWO, "scale is the metres in one unit"),

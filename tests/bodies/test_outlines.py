@@ -208,7 +208,10 @@ def test_remesh_refuses(make, message):
         ([[0, 0], [1, 0], [2, 0]], "crosses or touches itself"),
         ([[0, 0], [0, 0], [0, 0]], "corner 0 is there twice in a row"),
         ([[0, 0], [1, 0], [0.5, 4e-10]], "crosses or touches itself|encloses nothing"),
-        ([[0, 0], [1, 0], [np.nan, 1]], r"corners\[2\] is \[nan, 1.0\] .*give finite numbers, in m"),
+        (
+            [[0, 0], [1, 0], [np.nan, 1]],
+            r"corners\[2\] is \[nan, 1.0\] .*give finite numbers",
+        ),
         (1000 * SQUARE, r"outline is \d+ m; a body is 0.01 to 5 m large.*millimetres\?"),
         ([[0, 0], [1, 0]], "an outline of 2 corners is given; give at least 3"),
     ],

@@ -310,9 +310,15 @@ def changed(index, value):
 
 
 WRONG = {
-    "missing": (lambda path: None, "cannot be read as .npz (FileNotFoundError"),
-    "text": (lambda path: path.write_text("positions"), "cannot be read as .npz"),
-    "empty": (npz(goal=DIAGONAL), "it has no array 'positions'; write it with np.savez"),
+    "missing": (
+        lambda path: None,
+        "there is no such file; give an .npz file, written with np.savez",
+    ),
+    "text": (lambda path: path.write_text("positions"), "it is damaged, or is no .npz file"),
+    "empty": (
+        npz(goal=DIAGONAL),
+        "it has no array 'positions' (it has goal); give an .npz file",
+    ),
     "nan": (changed((7, 1), np.nan), "positions of particle 7 is"),
     "count": (
         npz(positions=DIAGONAL[:-1], rest=CLOTH.rest, faces=CLOTH.faces),
@@ -360,10 +366,10 @@ def test_a_goal_of_another_count_than_the_body_is_refused(letters, tmp_path, cap
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("body.obj", "body.obj has no triangles; give a file with the triangles of a surface"),
+        ("body.obj", "body.obj cannot be read as a mesh: it has no points ('v x y z'), or is no"),
         ("body.xyz", "body.xyz cannot be read as a mesh"),
-        ("body.npz", "body.npz: it cannot be read as .npz"),
-        ("missing.ply", "missing.ply cannot be read as a mesh"),
+        ("body.npz", "body.npz: it is damaged, or is no .npz file; give an .npz file, written"),
+        ("missing.ply", "missing.ply cannot be read as a mesh: there is no such file"),
     ],
 )
 def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys):
@@ -375,11 +381,11 @@ def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--method", "best"), "unknown method 'best'; choose from robust, paper"),
-        (("--tolerance", "0"), "tolerance is 0; give metres, above zero"),
-        (("--tolerance", "-1e-3"), "tolerance is -0.001; give metres, above zero"),
-        (("--tolerance", "nan"), "tolerance is nan; give metres, above zero"),
-        (("--max-stretch", "-0.1"), "max_stretch is -0.1; give a finite number, zero or more"),
+        (("--method", "best"), "method is 'best'; choose from robust, paper"),
+        (("--tolerance", "0"), "tolerance is 0.0; give a number from 1e-09 to 5 m"),
+        (("--tolerance", "-1e-3"), "tolerance is -0.001; give a number from"),
+        (("--tolerance", "nan"), "tolerance is nan; give a number from"),
+        (("--max-stretch", "-0.1"), "max_stretch is -0.1; give a number from 0 to 10 of the"),
         (("--lower", "0", "0", "1", "--upper", "1", "1", "0"), "give an upper bound above the"),
         (("--json", "none/out.json"), "none is no folder; make it, or give another --json"),
         (("--figure", "none/out.png"), "none is no folder; make it, or give another --figure"),
@@ -397,7 +403,9 @@ def test_wrong_options_are_refused(options, message, letters, tmp_path, capsys, 
 
 
 def test_a_refusal_is_one_line_whatever_the_path(tmp_path, capsys):
-    assert "two lines.npz: it cannot" in refused(capsys, tmp_path, tmp_path / "two\nlines.npz")
+    assert "two lines.npz: there is no such file" in refused(
+        capsys, tmp_path, tmp_path / "two\nlines.npz"
+    )
 
 
 def test_no_goal_is_refused(tmp_path, capsys):

@@ -293,8 +293,8 @@ def test_the_smallest_rope_and_an_empty_batch():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tolerance": 0.0}, "tolerance is 0; give a distance above zero"),
-        ({"max_size": 0}, "max_size is 0; at least 2"),
+        ({"tolerance": 0.0}, r"tolerance is 0.0; give a number from 1e-09 to 5 m"),
+        ({"max_size": 0}, "max_size is 0; give a whole number of at least 2"),
     ],
 )
 def test_bad_options_are_refused(options, message):

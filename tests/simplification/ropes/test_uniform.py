@@ -250,9 +250,9 @@ def test_the_entry_takes_a_rope():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tolerance": 0.0}, "tolerance is 0; give a distance above zero"),
+        ({"tolerance": 0.0}, r"tolerance is 0.0; give a number from 1e-09 to 5 m"),
         ({"tolerance": float("nan")}, "tolerance is nan"),
-        ({"max_size": 1}, "max_size is 1; at least 2"),
+        ({"max_size": 1}, "max_size is 1; give a whole number of at least 2"),
     ],
 )
 def test_bad_options_are_refused(options, message):
@@ -270,7 +270,7 @@ def test_bad_arguments_are_refused():
         simplify(ROPE, goal)
     with pytest.raises(ValueError, match=r"the goal has shape \(40, 3\)"):
         simplify(ROPE, goals.straight(ROPE)[:40])
-    with pytest.raises(ValueError, match="method is 'best'; choose one of robust"):
+    with pytest.raises(ValueError, match="method is 'best'; choose from robust"):
         simplify(ROPE, goals.straight(ROPE), method="best")
     with pytest.raises(ValueError, match="size is 42; a rope of 41 particles has 2 to 41"):
         interpolation_matrix(41, 42)

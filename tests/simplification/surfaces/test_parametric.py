@@ -340,8 +340,8 @@ def test_a_goal_in_one_point_has_the_fewest_key_points():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tolerance": 0.0}, "tolerance is 0; give a distance above zero"),
-        ({"max_size": 2}, "max_size is 2; at least 3"),
+        ({"tolerance": 0.0}, r"tolerance is 0.0; give a number from 1e-09 to 5 m"),
+        ({"max_size": 2}, "max_size is 2; give a whole number of at least 3"),
     ],
 )
 def test_bad_options_are_refused(options, message):

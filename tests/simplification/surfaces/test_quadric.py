@@ -297,8 +297,8 @@ def test_the_entry_takes_a_cloth():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tolerance": -1.0}, "tolerance is -1; give a distance above zero"),
-        ({"max_size": 3}, "max_size is 3; at least 4"),
+        ({"tolerance": -1.0}, r"tolerance is -1.0; give a number from 1e-09 to 5 m"),
+        ({"max_size": 3}, "max_size is 3; give a whole number of at least 4"),
     ],
 )
 def test_bad_options_are_refused(options, message):
