@@ -137,12 +137,13 @@ class Body:
             name: float(np.median(own if len(own) else stiffness))
             for name, own in zip(FAMILIES, members, strict=True)
         }
+        material = self.material.scaled(**by_family, **factors)
         return replace(
             self,
             mass=self.mass * factors.get("mass", 1.0),
             stiffness=self.stiffness * each,
             damping=self.damping * factors.get("damping", 1.0),
-            material=self.material.scaled(**by_family, **factors),
+            material=material,
         )
 
 

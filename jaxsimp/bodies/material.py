@@ -93,6 +93,7 @@ class Material:
         refuse_unknown(factors, (*FACTORS, *FAMILIES))
         values: dict[str, float] = {}
         for name, factor in factors.items():
+            factor = require_number(f"the factor of {name}", factor, -1e12, 1e12)
             for field in GROUPS.get(name, (name,)):
                 values[field] = factor * values.get(field, getattr(self, field))
         return replace(self, **values)
