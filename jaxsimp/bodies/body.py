@@ -80,11 +80,11 @@ class Body:
             own.flags.writeable = False
             object.__setattr__(self, name, own)
         _check_shapes(self)
+        if self.num_particles > 1 and np.isfinite(self.rest).all():
+            require_size(f"the largest extent of the {self.name}", self.size)
         for name, (lowest, highest, unit) in _FLOATS.items():
             require_numbers(name, getattr(self, name), lowest, highest, unit)
         _check_ids(self)
-        if self.num_particles > 1:
-            require_size(f"the largest extent of the {self.name}", self.size)
 
     def __reduce__(self) -> tuple[type["Body"], tuple[Any, ...]]:
         """Make copies with the constructor, since pickled arrays lose their read-only flag."""

@@ -1,4 +1,4 @@
-"""Mesh files from elsewhere: the file's points in its order, each once, or what is wrong with it."""
+"""Mesh files from elsewhere: their points in order, each once, or what is wrong with the file."""
 
 import json
 import re
@@ -210,9 +210,10 @@ def test_a_damaged_file_is_told_by_the_file(suffix, share, seed, tmp_path):
     path.write_bytes(content)
     try:
         points, _ = load_mesh(path, up="z")
-    except ValueError as error:
-        assert str(error).startswith(str(path))
-        assert "No module named" not in str(error)
+    except ValueError:
+        told = f"^{re.escape(str(path))}((?!No module named).)*$"
+        with pytest.raises(ValueError, match=told):
+            load_mesh(path, up="z")
     else:
         assert np.isfinite(points).all()
 

@@ -292,6 +292,28 @@ def test_the_picture_shows_models_and_errors_beside_each_other(
     assert (tmp_path / "goals.png").exists()
 
 
+def test_files_of_another_unit_and_axis_are_taken_with_their_options(tmp_path, capsys):
+    small = cloth((5, 5))
+    stored = 1000 * small.rest[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    for name in ("body.obj", "goal.obj"):
+        trimesh.Trimesh(stored, small.faces, process=False).export(tmp_path / name)
+    out = tmp_path / "out.json"
+    files = (tmp_path / "goal.obj", "--body", tmp_path / "body.obj", "--json", out)
+    told = refused(capsys, tmp_path, *files)
+    assert "body.obj: the largest extent of the mesh is 300 m" in told
+    assert "millimetres? scale=0.001" in told
+    assert command(*files, "--scale", "0.001") == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"hint: {tmp_path / 'body.obj'} is flat and stands on edge, 0.3 m high")
+    assert "under the table" in told
+    assert command(*files, "--scale", "0.001", "--up", "y") == 0
+    assert capsys.readouterr().err == ""
+    wanted = jaxsimp.simplify(small, small.rest)
+    assert json.loads(out.read_text())["key_points"] == wanted.particles.tolist()
+    assert "up is 'w'; choose from x, y, z" in refused(capsys, tmp_path, *files, "--up", "w")
+    assert "scale is 0.0; give a number" in refused(capsys, tmp_path, *files, "--scale", "0")
+
+
 # --- refusals ------------------------------------------------------------------------------------
 
 
