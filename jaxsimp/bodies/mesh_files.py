@@ -155,11 +155,13 @@ def _triangles(polygons: list[list[int]]) -> np.ndarray:
 
     if {len(polygon) for polygon in polygons} == {4}:
         return np.asarray(triangulate_quads(polygons))
-    fans = [
-        [polygon[0], *polygon[place : place + 2]]
-        for polygon in polygons
-        for place in range(1, len(polygon) - 1)
-    ]
+    fans: list[list[int]] = []
+    for polygon in polygons:
+        if len(polygon) == 4:
+            a, b, c, d = polygon
+            fans += [[a, b, c], [c, d, a]]  # as trimesh has them
+        else:
+            fans += [[polygon[0], *polygon[i : i + 2]] for i in range(1, len(polygon) - 1)]
     return np.array(fans, dtype=np.int64).reshape(-1, 3)
 
 

@@ -189,6 +189,7 @@ def simplified(options: Options) -> list[SimplifiedGoal]:
 
     scale, up = options.scale, options.up
     with warnings.catch_warnings(record=True) as hints:
+        warnings.simplefilter("always")
         body = load_body(options.body, scale=scale, up=up) if options.body else None
     for hint in hints:
         Console(stderr=True).print(f"hint: {hint.message}", markup=False, soft_wrap=True)
