@@ -18,8 +18,6 @@ from jaxsimp.goals.check import MAX_STRETCH, NOISE, check_goal
 from jaxsimp.goals.flatten import flatten
 from jaxsimp.goals.shapes import Positions
 
-MEMBERS = ("positions", "rest", "faces")
-"""Arrays of an `.npz` file."""
 SPREAD = 8.0
 """Distance of neighbours above the usual one, in median deviations, that noise explains: 5 are the
 most of 1000 steps of any Gaussian noise."""
@@ -60,7 +58,8 @@ def load_goal(
             or the goal is invalid (see `check_goal`).
     """
     with _naming(path):
-        arrays = _scaled(_read(path, "positions"), scale, up)
+        members = ("positions", "rest", "faces") if body is None else ("positions",)
+        arrays = _scaled(_read(path, members), scale, up)
         positions = arrays["positions"]
         if body is None and not _holds_arrays(path):
             raise ValueError(
@@ -96,7 +95,7 @@ def load_body(path: str | Path, *, scale: float = 1.0, up: str | None = None) ->
     with _naming(path):
         if not _holds_arrays(path):
             return from_mesh(*load_mesh(path, scale=scale, up=up))
-        arrays = _scaled(_read(path, "rest"), scale, up or "z")
+        arrays = _scaled(_read(path, ("rest", "faces")), scale, up or "z")
         return _body_of(arrays["rest"], arrays)
 
 
@@ -115,8 +114,9 @@ def _naming(path: str | Path) -> Iterator[None]:
         raise ValueError(message if named else f"{path}: {message}") from error
 
 
-def _read(path: str | Path, needed: str) -> dict[str, np.ndarray]:
-    """The arrays of a file that define a goal or a body."""
+def _read(path: str | Path, members: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Those arrays of a file that it has; the first is needed."""
+    needed = members[0]
     if not _holds_arrays(path):
         return {needed: read_mesh(path)[0]}
     remedy = f"an .npz file, written with np.savez(path, {needed}={needed})"
@@ -126,7 +126,7 @@ def _read(path: str | Path, needed: str) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(data) as archive:
             names = archive.namelist()
-            held = [name for name in MEMBERS if f"{name}.npy" in names]
+            held = [name for name in members if f"{name}.npy" in names]
             # The header says how large an array is before it is unpacked.
             arrays = {}
             for name in held:

@@ -206,6 +206,11 @@ def test_an_npy_file_holds_positions_or_rest(tmp_path):
     np.testing.assert_allclose(load_body(tmp_path / "rest.npy").rest, ROPE.rest, atol=1e-12)
 
 
+def test_what_a_file_holds_beside_the_goal_of_a_body_does_not_matter(tmp_path):
+    path = save(tmp_path / "goal.npz", positions=FOLDED, faces=np.ones(3), rest=np.array("flat"))
+    np.testing.assert_array_equal(load_goal(path, CLOTH)[1], FOLDED)
+
+
 def raw(**members: bytes) -> bytes:
     """A zip file with these members."""
     file = io.BytesIO()
