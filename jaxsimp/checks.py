@@ -85,6 +85,67 @@ def require_choice(name: str, value: object, known: Collection[str]) -> None:
         raise ValueError(f"{name} is {_told(value)}; choose from {', '.join(known)}")
 
 
+def require_ids(name: str, values: object, count: int, of: str = "particles") -> np.ndarray:
+    """Whole numbers from 0 to below `count`, of any shape, as an array of int64.
+
+    Args:
+        name: name of the ids, for the message.
+        values: what was given.
+        count: number of things that they name.
+        of: what they name, for the message.
+
+    Raises:
+        ValueError: if a value is no whole number, or names nothing.
+    """
+    array = require_whole(name, values)
+    wrong = array[(array < 0) | (array >= count)]
+    if wrong.size and not count:
+        raise ValueError(f"{name} names {wrong[0]}, and there are no {of}; give them first")
+    if wrong.size:
+        raise ValueError(f"{name} names {wrong[0]}; the ids of {count} {of} are 0 to {count - 1}")
+    return array
+
+
+def require_whole(name: str, values: object) -> np.ndarray:
+    """Whole numbers, of any shape, as an array of int64.
+
+    Raises:
+        ValueError: if they are no array of whole numbers.
+    """
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError):
+        array = np.asarray(None)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name} is {_told(values)}; give an array of whole numbers")
+    return array.astype(np.int64)
+
+
+def require_rows(name: str, values: object, width: int, unit: str = "m") -> np.ndarray:
+    """Rows of finite real numbers, shape (_, `width`), as an array of floats.
+
+    Args:
+        name: name of the array, for the message.
+        values: what was given.
+        width: numbers in a row.
+        unit: their unit, for the message.
+
+    Raises:
+        ValueError: if the shape or a value is another one.
+    """
+    array = as_reals(values)
+    if array is None or array.ndim != 2 or array.shape[1] != width:
+        told = _told(values) if array is None else f"an array of shape {array.shape}"
+        raise ValueError(f"{name} is {told}; give rows of {width} real numbers, in {unit}")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"{name}[{bad[0]}] is {array[bad[0]].tolist()} ({bad.size} such rows); give finite "
+            f"numbers, in {unit}"
+        )
+    return array
+
+
 def as_reals(values: object) -> np.ndarray | None:
     """Values as an array of floats; None if they are no real numbers, or no rectangular array."""
     try:

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from jaxsimp.checks import require_choice, require_count, require_number, require_numbers
+from jaxsimp.checks import (
+    require_choice,
+    require_count,
+    require_ids,
+    require_number,
+    require_numbers,
+    require_rows,
+    require_whole,
+)
 
 
 @pytest.mark.parametrize("value", [3, np.int32(3), np.uint8(3)])
@@ -55,3 +63,52 @@ def test_a_choice_is_one_of_the_known_names():
     for value in ("papr", None, ["paper"]):
         with pytest.raises(ValueError, match=r"method is .*; choose from robust, paper"):
             require_choice("method", value, ("robust", "paper"))
+
+
+@pytest.mark.parametrize("values", [[0, 2], np.array([2, 0], np.uint8), np.zeros((2, 0), int)])
+def test_ids_of_any_whole_type_and_shape_are_int64(values):
+    found = require_ids("faces", values, 3)
+    assert found.dtype == np.int64
+    np.testing.assert_array_equal(found, values)
+
+
+@pytest.mark.parametrize(
+    ("values", "count", "message"),
+    [
+        ([0, 3], 3, "faces names 3; the ids of 3 points are 0 to 2"),
+        ([-1], 3, "faces names -1; the ids of 3 points"),
+        ([2**40], 3, "faces names 1099511627776"),
+        ([0], 0, "faces names 0, and there are no points; give them first"),
+        ([0.0], 3, r"faces is \[0.0\]; give an array of whole numbers"),
+        ([True], 3, r"faces is \[True\]; give an array of whole"),
+        ([[0], [1, 2]], 3, "faces is .*; give an array of whole"),
+        (None, 3, "faces is None; give an array of whole"),
+    ],
+)
+def test_what_names_nothing_is_refused(values, count, message):
+    with pytest.raises(ValueError, match=message):
+        require_ids("faces", values, count, "points")
+
+
+@pytest.mark.parametrize("values", [[0.5], "ab", None, 1j, [[1], [1, 2]]])
+def test_what_is_no_array_of_whole_numbers_is_refused(values):
+    with pytest.raises(ValueError, match="ids is .*; give an array of whole numbers"):
+        require_whole("ids", values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([1.0, 2.0], r"points is an array of shape \(2,\); give rows of 3 real numbers, in m"),
+        ([[1.0, 2.0]], r"points is an array of shape \(1, 2\); give rows of 3"),
+        ([[1j, 0, 0]], r"points is \[\[1j, 0, 0\]\]; give rows of 3 real numbers"),
+        (
+            [[0, 0, 0], [0, math.inf, 0]],
+            r"points\[1\] is \[0.0, inf, 0.0\] \(1 such rows\); give fin",
+        ),
+    ],
+)
+def test_rows_are_finite_numbers_of_one_width(values, message):
+    np.testing.assert_array_equal(require_rows("points", [[1, 2, 3]], 3), [[1.0, 2.0, 3.0]])
+    with pytest.raises(ValueError, match=message):
+        require_rows("points", values, 3)

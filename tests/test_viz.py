@@ -273,7 +273,7 @@ def ball():
 def test_a_surface_of_any_topology_is_drawn_with_its_boundary(make, around):
     body = make()
     axes = plt.figure().add_subplot(projection="3d")
-    viz.draw_body(axes, body, goals.flat(body), "red")
+    viz.draw_body(axes, body, body.rest, "red")
     surface, *lines = axes.collections
     assert len(surface.get_facecolor()) == len(body.faces)
     segments = np.concatenate(

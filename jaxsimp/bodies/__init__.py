@@ -4,7 +4,8 @@ from jaxsimp.bodies.body import Body
 from jaxsimp.bodies.constructors import cloth, from_mesh, rope, rope_along
 from jaxsimp.bodies.garments import Garment, skirt, t_shirt, towel, trousers
 from jaxsimp.bodies.material import MATERIALS, Material
-from jaxsimp.bodies.meshes import clean_mesh, load_mesh, read_mesh
+from jaxsimp.bodies.mesh_files import load_mesh, read_mesh
+from jaxsimp.bodies.meshes import clean_mesh
 from jaxsimp.bodies.outlines import mesh_outline, mesh_symmetric_outline, remesh
 
 __all__ = [

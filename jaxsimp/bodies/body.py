@@ -14,14 +14,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.checks import (
-    require_at_least_zero,
-    require_count,
-    require_finite,
-    require_positive,
-)
 from jaxsimp.bodies.material import FACTORS, FAMILIES, Material, refuse_unknown
+from jaxsimp.bodies.size import LARGEST, MOST_PARTICLES, require_size
 from jaxsimp.bodies.topology import distinct_edges
+from jaxsimp.checks import as_reals, require_count, require_ids, require_numbers, require_whole
+
+_FLOATS: dict[str, tuple[float, float, str]] = {
+    "rest": (-10 * LARGEST, 10 * LARGEST, "m"),
+    "mass": (1e-12, 1e3, "kg"),
+    "rest_length": (1e-9, 10 * LARGEST, "m"),
+    "stiffness": (0.0, 1e12, "N/m"),
+    "damping": (0.0, 1e12, "N s/m"),
+}
+"""Limits of the arrays' values: generous, and far from overflow in float32."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +55,9 @@ class Body:
 
     Raises:
         ValueError: if an array has the wrong shape or a value out of range, if there are no
-            particles, or if a spring joins a particle to itself or a pair already joined.
+            particles or more than `MOST_PARTICLES`, if the extent is outside `SMALLEST` to
+            `LARGEST` (see `jaxsimp.bodies.size`), or if a spring joins a particle to itself or a
+            pair already joined.
     """
 
     name: str
@@ -66,18 +73,18 @@ class Body:
     shape: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                own = value.copy(order="K")
-                own.flags.writeable = False
-                object.__setattr__(self, field.name, own)
-        _check_arrays(self)
+        if not isinstance(self.material, Material):
+            raise ValueError(f"material is {self.material!r}; give a jaxsimp.Material")
+        for name in (*_FLOATS, "springs", "families", "faces"):
+            own = _own(name, getattr(self, name))
+            own.flags.writeable = False
+            object.__setattr__(self, name, own)
+        _check_shapes(self)
+        if self.num_particles > 1 and np.isfinite(self.rest).all():
+            require_size(f"the largest extent of the {self.name}", self.size)
+        for name, (lowest, highest, unit) in _FLOATS.items():
+            require_numbers(name, getattr(self, name), lowest, highest, unit)
         _check_ids(self)
-        for name in ("stiffness", "damping"):
-            require_at_least_zero(name, getattr(self, name))
-        for name in ("mass", "rest_length"):
-            require_positive(name, getattr(self, name))
 
     def __reduce__(self) -> tuple[type["Body"], tuple[Any, ...]]:
         """Make copies with the constructor, since pickled arrays lose their read-only flag."""
@@ -119,24 +126,45 @@ class Body:
             ValueError: if a product is out of the parameter's range.
         """
         refuse_unknown(factors, FACTORS)
+        if np.ndim(stiffness) and np.shape(stiffness) != self.stiffness.shape:
+            raise ValueError(
+                f"stiffness has shape {np.shape(stiffness)}; give one factor, or one for each of "
+                f"{len(self.stiffness)} springs"
+            )
         each = np.broadcast_to(stiffness, self.stiffness.shape)
         members = [each[self.families == family] for family in range(len(FAMILIES))]
         by_family = {
             name: float(np.median(own if len(own) else stiffness))
             for name, own in zip(FAMILIES, members, strict=True)
         }
+        material = self.material.scaled(**by_family, **factors)
         return replace(
             self,
             mass=self.mass * factors.get("mass", 1.0),
             stiffness=self.stiffness * each,
             damping=self.damping * factors.get("damping", 1.0),
-            material=self.material.scaled(**by_family, **factors),
+            material=material,
         )
 
 
-def _check_arrays(body: Body) -> None:
+def _own(name: str, values: Any) -> np.ndarray:
+    """A copy of an array of the body: whole numbers for ids, floats for the rest."""
+    if name not in _FLOATS:
+        return require_whole(name, values)
+    reals = as_reals(values)
+    if reals is None:
+        raise ValueError(f"{name} holds no real numbers; give an array in {_FLOATS[name][2]}")
+    given = np.asarray(values)
+    whole_or_half = given.dtype.kind != "f" or given.dtype.itemsize < 4
+    return reals if whole_or_half else given.copy(order="K")
+
+
+def _check_shapes(body: Body) -> None:
+    for name in ("rest", "springs", "faces"):
+        if not getattr(body, name).ndim:
+            raise ValueError(f"{name} is a single number; give an array, one row for each")
     count, num_springs = len(body.rest), len(body.springs)
-    require_count("num_particles", count, 1)
+    require_count("num_particles", count, 1, MOST_PARTICLES)
     expected = {
         "rest": (count, 3),
         "mass": (count,),
@@ -150,19 +178,15 @@ def _check_arrays(body: Body) -> None:
     for name, shape in expected.items():
         array = getattr(body, name)
         if array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}; {shape} is needed")
-        require_finite(name, array)
+            raise ValueError(
+                f"{name} has shape {array.shape}; {shape} is needed: the body has {count} "
+                f"particles, the rows of rest, and {num_springs} springs"
+            )
 
 
 def _check_ids(body: Body) -> None:
-    count = body.num_particles
     for name in ("springs", "faces"):
-        ids = getattr(body, name)
-        if ids.size and (ids.min() < 0 or ids.max() >= count):
-            raise ValueError(
-                f"{name} names particle {ids.max() if ids.max() >= count else ids.min()}; "
-                f"a body of {count} particles has ids 0 to {count - 1}"
-            )
+        require_ids(name, getattr(body, name), body.num_particles)
     unknown = np.flatnonzero((body.families < 0) | (body.families >= len(FAMILIES)))
     if unknown.size:
         raise ValueError(

@@ -3,14 +3,17 @@
 Each takes a material, by default that of its kind in `MATERIALS`, and changes of single parameters.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsimp.bodies.body import Body
-from jaxsimp.bodies.checks import require_count, require_finite, require_positive
 from jaxsimp.bodies.material import FAMILIES, MATERIALS, Material
 from jaxsimp.bodies.meshes import clean_mesh, face_areas, spring_weights
+from jaxsimp.bodies.size import MOST_PARTICLES, require_size
 from jaxsimp.bodies.topology import chain
+from jaxsimp.checks import require_count, require_number, require_rows
 
 MASS = 0.02
 """Default mass of a rope and of a cloth of any size, kilograms."""
@@ -38,8 +41,8 @@ def rope(
         ValueError: if a number is out of its range, or both a mass and a density are given.
         TypeError: if `Material` has no parameter of a name in `changes`.
     """
-    require_count("num_particles", num_particles, 2)
-    require_positive("length", length)
+    num_particles = require_count("num_particles", num_particles, 2, MOST_PARTICLES)
+    length = require_size("length", length)
     rest = np.zeros((num_particles, 3))
     rest[:, 0] = np.linspace(-length / 2, length / 2, num_particles)
     return rope_along(rest, mass=mass, material=material, **changes)
@@ -64,11 +67,16 @@ def rope_along(
         ValueError: if a number is out of its range, or particles joined by a spring coincide.
         TypeError: if `Material` has no parameter of a name in `changes`.
     """
-    count = len(points)
-    require_count("num_particles", count, 2)
-    require_finite("points", points)
+    points = require_rows("points", points, 3)
+    count = require_count("num_particles", len(points), 2, MOST_PARTICLES)
     segments = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    require_positive("rest_length", segments)
+    same = np.flatnonzero(segments < 1e-9)
+    if same.size:
+        raise ValueError(
+            f"particles {same[0]} and {same[0] + 1} of the rope are at the same place "
+            f"({same.size} such pairs); leave one out, or move it"
+        )
+    require_size("the largest extent of points", float(np.ptp(points, axis=0).max()))
     made, mass = _weigh("rope", material, changes, mass, float(segments.sum()))
     _refuse_shear("rope", made)
     no_springs, no_faces = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3), dtype=np.int64)
@@ -102,14 +110,14 @@ def cloth(
         ValueError: if a number is out of its range, or both a mass and a density are given.
         TypeError: if `Material` has no parameter of a name in `changes`.
     """
-    for count, extent in zip(shape, size, strict=True):
-        require_count("shape", count, 2)
-        require_positive("size", extent)
-    made, mass = _weigh("cloth", material, changes, mass, size[0] * size[1])
-    rows, columns = shape
+    rows, columns = (require_count("shape", each, 2) for each in _two("shape", shape))
+    require_count("the number of particles, rows times columns,", rows * columns, 4, MOST_PARTICLES)
+    shape = (rows, columns)
+    long, wide = (require_size("size", each, smallest=1e-6) for each in _two("size", size))
+    made, mass = _weigh("cloth", material, changes, mass, long * wide)
     grid = np.arange(rows * columns).reshape(shape)
-    x = np.linspace(-size[0] / 2, size[0] / 2, rows)
-    y = np.linspace(-size[1] / 2, size[1] / 2, columns)
+    x = np.linspace(-long / 2, long / 2, rows)
+    y = np.linspace(-wide / 2, wide / 2, columns)
     rest = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros(shape)], axis=-1).reshape(-1, 3)
     return _mass_spring("cloth", rest, _grid_springs(grid), _grid_faces(grid), made, mass, shape)
 
@@ -152,7 +160,7 @@ def from_mesh(
         ValueError: if `clean_mesh` refuses the mesh, or a number is out of its range.
         TypeError: if `Material` has no parameter of a name in `changes`.
     """
-    material = material.changed(**changes)
+    material = _material(material, "mesh").changed(**changes)
     _refuse_shear(name, material)
     points, faces = clean_mesh(points, faces, scale=scale)
     (edges, along), (pairs, across) = spring_weights(points, faces)
@@ -174,6 +182,13 @@ def from_mesh(
     )
 
 
+def _two(name: str, values: object) -> tuple[object, object]:
+    both = tuple(values) if isinstance(values, Iterable) else ()
+    if len(both) != 2:
+        raise ValueError(f"{name} is {values!r}; give two numbers, along x and along y")
+    return both
+
+
 def _weigh(
     kind: str,
     material: Material | None,
@@ -185,17 +200,27 @@ def _weigh(
 
     `extent` is the body's length, metres, or its area, square metres.
     """
+    made = _material(material, kind).changed(**changes)
+    if mass is not None:
+        mass = require_number("mass", mass, 1e-6, 1e3, "kg")
     if mass is not None and "density" in changes:
         raise ValueError(
             f"mass is {mass:g} and density is {changes['density']:g}; give one of them, the other "
             f"follows from the size"
         )
-    made = (material or MATERIALS[kind]).changed(**changes)
     if mass is None and (material is not None or "density" in changes):
         return made, made.density * extent
     mass = MASS if mass is None else mass
-    require_positive("mass", mass)
     return made.changed(density=mass / extent), mass
+
+
+def _material(material: Material | None, kind: str) -> Material:
+    """The material, by default that of the kind."""
+    if material is not None and not isinstance(material, Material):
+        raise ValueError(
+            f"material is {material!r}; give a jaxsimp.Material, as jaxsimp.MATERIALS[{kind!r}]"
+        )
+    return material or MATERIALS[kind]
 
 
 def _refuse_shear(name: str, material: Material) -> None:

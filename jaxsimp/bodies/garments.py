@@ -22,7 +22,9 @@ from jaxsimp.bodies.material import MATERIALS
 from jaxsimp.bodies.meshes import Points
 from jaxsimp.bodies.outlines import COUNT_TOLERANCE, mesh_symmetric_outline
 from jaxsimp.bodies.sewing import sew
+from jaxsimp.bodies.size import LARGEST, MOST_PARTICLES, require_size
 from jaxsimp.bodies.topology import Faces, boundary_loops
+from jaxsimp.checks import require_count, require_number
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,7 @@ def towel(
         options: arguments of `from_mesh`; the material is `MATERIALS["garment"]` by default.
 
     Raises:
-        ValueError: if a dimension is not above zero, or another argument is out of range.
+        ValueError: if a dimension is no length of a body, or another argument is out of range.
     """
     _require(length=length, width=width)
     half = {
@@ -104,7 +106,7 @@ def t_shirt(
             by default, with half the density, stiffness and damping for two sheets.
 
     Raises:
-        ValueError: if a dimension is not above zero, the outline is not that of a T-shirt, or
+        ValueError: if a dimension is no length of a body, the outline is not that of a T-shirt, or
             another argument is out of range.
     """
     _require(
@@ -115,8 +117,7 @@ def t_shirt(
         neck_width=neck_width,
         neck_depth=neck_depth,
     )
-    if not 0 <= slope <= 60:
-        raise ValueError(f"slope is {slope:g}; give 0 to 60 degrees")
+    slope = require_number("slope", slope, 0.0, 60.0, "degrees")
     _require_less("neck_width", neck_width, "the chest", chest)
     cos, sin = np.cos(np.deg2rad(slope)), np.sin(np.deg2rad(slope))
     shoulder = np.array([chest / 2, (neck_width - chest) / 2 * sin / cos])
@@ -171,10 +172,11 @@ def trousers(
             by default, with half the density, stiffness and damping for two sheets.
 
     Raises:
-        ValueError: if a dimension is not above zero, the outline is not that of trousers, or
+        ValueError: if a dimension is no length of a body, the outline is not that of trousers, or
             another argument is out of range.
     """
     _require(length=length, waist=waist, rise=rise, cuff=cuff)
+    spread = require_number("spread", spread, -LARGEST, LARGEST, "m")
     _require_less("rise", rise, "the length", length)
     _require_less("cuff", cuff, "half the waist and spread", waist / 2 + spread)
     half = {
@@ -210,7 +212,7 @@ def skirt(
             by default, with half the density, stiffness and damping for two sheets.
 
     Raises:
-        ValueError: if a dimension is not above zero, or another argument is out of range.
+        ValueError: if a dimension is no length of a body, or another argument is out of range.
     """
     _require(length=length, waist=waist, hem=hem)
     half = {
@@ -240,8 +242,8 @@ def _make(
 
     Of two sheets those sides of the outline are sewn that begin at the corners `seams`.
     """
-    if sheets not in (1, 2):
-        raise ValueError(f"sheets is {sheets}; give 1, or 2 for front and back")
+    sheets = require_count("sheets", sheets, 1, 2)
+    num_particles = require_count("num_particles", num_particles, 3, MOST_PARTICLES)
     options = {"name": name, "material": MATERIALS["garment"].scaled(**_PART[sheets]), **options}
     if sheets == 1:
         mesh = mesh_symmetric_outline(np.array(list(half.values())), num_particles)
@@ -332,8 +334,7 @@ def _seam(half: Half, mesh: SheetMesh, seams: tuple[str, ...]) -> Int[np.ndarray
 
 def _require(**dimensions: float) -> None:
     for name, value in dimensions.items():
-        if not 0 < value < np.inf:
-            raise ValueError(f"{name} is {value:g}; give a length above zero, in metres")
+        require_size(name, value, smallest=1e-3)
 
 
 def _require_less(name: str, value: float, limit_name: str, limit: float) -> None:

@@ -7,7 +7,7 @@ calibrations can fit it and ensembles can vary it.
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 
-from jaxsimp.bodies.checks import require_at_least_zero, require_positive
+from jaxsimp.checks import require_number
 
 FAMILIES = ("stretch_stiffness", "shear_stiffness", "bend_stiffness")
 """Families of springs, by the name of their stiffness; `Body.families` holds indices into this."""
@@ -16,6 +16,18 @@ PARAMETERS = ("stiffness", "damping", "drag", "friction")
 FACTORS = ("mass", *PARAMETERS, "thickness")
 """Parameters that `Material.scaled` and `Body.scaled` multiply; `mass` stands for the density."""
 GROUPS = MappingProxyType({"mass": ("density",), "stiffness": FAMILIES})
+LIMITS = MappingProxyType(
+    {
+        "density": (1e-6, 1e6, "kg/m (a sheet: kg/m2)"),
+        **dict.fromkeys(FAMILIES, (0.0, 1e9, "N/m")),
+        "damping": (0.0, 1e6, "N s/m"),
+        "drag": (0.0, 1e6, "/s"),
+        "friction": (0.0, 1e3, ""),
+        "thickness": (0.0, 1.0, "m"),
+    }
+)
+"""Lowest and highest value of each parameter, and its unit: far beyond any rope or cloth, and far
+from overflow in float32."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +50,7 @@ class Material:
         thickness: metres; a particle rests on the table at half of it.
 
     Raises:
-        ValueError: if the density is not a finite number above zero, or another parameter is not
-            a finite number of zero or more.
+        ValueError: if a parameter is not a number within its `LIMITS`.
     """
 
     density: float
@@ -52,9 +63,8 @@ class Material:
     thickness: float
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            require = require_positive if field.name == "density" else require_at_least_zero
-            require(field.name, getattr(self, field.name))
+        for name, limits in LIMITS.items():
+            require_number(name, getattr(self, name), *limits)
 
     def changed(self, **values: float) -> "Material":
         """The material with other values of some parameters.
@@ -83,6 +93,7 @@ class Material:
         refuse_unknown(factors, (*FACTORS, *FAMILIES))
         values: dict[str, float] = {}
         for name, factor in factors.items():
+            factor = require_number(f"the factor of {name}", factor, -1e12, 1e12)
             for field in GROUPS.get(name, (name,)):
                 values[field] = factor * values.get(field, getattr(self, field))
         return replace(self, **values)

@@ -1,16 +1,19 @@
-"""Triangle meshes: read from files, welded, cleaned and checked.
+"""Triangle meshes: welded, cleaned and checked.
 
 A mesh is two arrays, points of shape (V, 3) and triangles of shape (F, 3). Harmless faults are
 repaired: coincident points, repeated or empty triangles, points of no triangle, triangles that
 face the wrong way. A fault whose repair would change the surface raises an error.
 """
 
-import warnings
-from pathlib import Path
-
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxsimp.bodies.size import (
+    MOST_PARTICLES,
+    MOST_TRIANGLES,
+    require_scale,
+    require_size,
+)
 from jaxsimp.bodies.topology import (
     Faces,
     are_among,
@@ -20,6 +23,7 @@ from jaxsimp.bodies.topology import (
     inner_edges,
     shared_half_edges,
 )
+from jaxsimp.checks import as_reals, require_choice, require_ids, require_whole
 
 Points = Float[np.ndarray, "V 3"]
 Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
@@ -28,59 +32,8 @@ Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
 WELD = 1e-5
 """Distance, relative to the largest extent, below which points are one point, and height below
 which a triangle is empty. Above the rounding of a float32 file, below any triangle of a cloth."""
-SMALLEST, LARGEST = 0.02, 5.0
-"""Limits of a body's largest extent, metres."""
-UNITS = (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254))
-
-
-def load_mesh(path: str | Path, *, scale: float = 1.0) -> Mesh:
-    """A clean mesh from a file: `read_mesh`, then `clean_mesh`.
-
-    Args:
-        path: an OBJ, PLY, STL, OFF or GLB file, or another format that trimesh reads.
-        scale: metres in one unit of the file: 0.001 for millimetres.
-
-    Raises:
-        ValueError: if the file holds no mesh, or one that `clean_mesh` refuses.
-    """
-    points, faces = read_mesh(path)
-    try:
-        return clean_mesh(points, faces, scale=scale)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def read_mesh(path: str | Path) -> Mesh:
-    """Points and triangles of a file: in its order and unit, unwelded, unchecked.
-
-    Splits polygons into triangles, and joins the parts of a scene. Axes stay unchanged, z up.
-
-    Args:
-        path: an OBJ, PLY, STL, OFF or GLB file, or another format that trimesh reads.
-
-    Raises:
-        ValueError: if the file cannot be read, or has no triangles.
-    """
-    import trimesh
-
-    # Each option that would reorder, split or merge points is off.
-    options = {"maintain_order": True, "group_material": False, "skip_materials": True}
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            mesh = trimesh.load_mesh(Path(path), process=False, **options)
-            points = np.array(mesh.vertices, dtype=float)
-            faces = np.array(mesh.faces, dtype=np.int64)
-        if faces.size:
-            _check_shapes(points, faces)
-    except Exception as error:  # the readers raise many kinds of errors on a broken file
-        raise ValueError(
-            f"{path} cannot be read as a mesh ({type(error).__name__}: {error}); "
-            f"give an OBJ, PLY, STL, OFF or GLB file"
-        ) from error
-    if not faces.size:
-        raise ValueError(f"{path} has no triangles; give a file with the triangles of a surface")
-    return points, faces
+FLAT = 1e-3
+"""Largest height of a flat mesh, relative to its extent."""
 
 
 def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
@@ -97,15 +50,14 @@ def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
         scale: metres in one unit of `points`.
 
     Raises:
-        ValueError: if ids or coordinates are invalid, no triangle remains, the extent is outside
-            `SMALLEST` to `LARGEST`, an edge has more than two triangles, the mesh is in several
-            pieces, or it has one side only.
+        ValueError: if ids or coordinates are invalid, no triangle remains, the extent is that
+            of no body (see `jaxsimp.bodies.size`), an edge has more than two triangles, the mesh is
+            in several pieces, or it has one side only.
     """
-    if not 0 < scale < np.inf:
-        raise ValueError(f"scale is {scale}; give the metres in one unit of the mesh")
-    _check_shapes(points, faces)
+    scale = require_scale(scale)
+    points, faces = as_mesh(points, faces)
     points, faces = _referenced(points, _distinct_ids(points, faces))
-    points = scale * points.astype(float)
+    points = scale * points
     _check_coordinates(points)
     tolerance = WELD * float(np.ptp(points, axis=0).max())
     faces = _without_dirt(points, _weld(points, tolerance)[faces], tolerance)
@@ -114,6 +66,45 @@ def clean_mesh(points: Points, faces: Faces, *, scale: float = 1.0) -> Mesh:
     points, faces = _referenced(points, faces)
     _check_edges(points, faces)
     return points, _oriented(points, faces)
+
+
+def as_mesh(points: object, faces: object) -> Mesh:
+    """Points as floats, finite or not, and triangles as whole numbers, of any id.
+
+    Raises:
+        ValueError: if an array has another shape or type, or there are more than `MOST_PARTICLES`
+            points or `MOST_TRIANGLES` triangles.
+    """
+    coordinates = as_reals(points)
+    if coordinates is None:
+        raise ValueError("points holds no real numbers; give a row of x, y, z for each point")
+    ids = require_whole("faces", faces)
+    for name, array in (("points", coordinates), ("faces", ids)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError(f"{name} has shape {array.shape}; a row of three is needed for each")
+    for name, count, most in (
+        ("points", len(coordinates), MOST_PARTICLES),
+        ("triangles", len(ids), MOST_TRIANGLES),
+    ):
+        if count > most:
+            raise ValueError(f"the mesh has {count} {name}; {most} is the limit: decimate it")
+    return coordinates, ids
+
+
+def z_up(points: np.ndarray, up: str) -> np.ndarray:
+    """Points turned so that z is up, shape (V, 3).
+
+    Args:
+        points: shape (V, 3).
+        up: the axis that is up so far: "x", "y" or "z".
+
+    Raises:
+        ValueError: if `up` is another one.
+    """
+    require_choice("up", up, ("x", "y", "z"))
+    if up == "y":
+        return np.stack([points[:, 0], -points[:, 2], points[:, 1]], axis=1)
+    return points[:, [1, 2, 0]] if up == "x" else points
 
 
 def covering_radii(
@@ -176,22 +167,11 @@ def spring_weights(
     return (pairs, total / length**2), (across[free], weight[free])
 
 
-def _check_shapes(points: np.ndarray, faces: np.ndarray) -> None:
-    for name, array in (("points", points), ("faces", faces)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name} has shape {array.shape}; a row of three is needed for each")
-
-
 def _distinct_ids(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Triangles of three different points."""
     if not len(faces):
         raise ValueError("the mesh has no triangles; give a surface")
-    wrong = faces[(faces < 0) | (faces >= len(points))]
-    if wrong.size:
-        raise ValueError(
-            f"a triangle names point {wrong[0]}; a mesh of {len(points)} points has ids 0 to "
-            f"{len(points) - 1}"
-        )
+    require_ids("a triangle", faces, len(points), "points")
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     if not len(faces):
@@ -213,18 +193,9 @@ def _check_coordinates(points: np.ndarray) -> None:
             f"{points[bad[0]].tolist()}; give finite coordinates"
         )
     extent = float(np.ptp(points, axis=0).max())
-    if SMALLEST <= extent <= LARGEST:
-        return
     if extent == 0:
         raise ValueError("every triangle is empty (all points coincide); give a surface")
-    guesses = [f"{name}? scale={scale:g}" for name, scale in UNITS if 0.1 <= extent * scale <= 2]
-    if 0.1 <= extent * 1e3 <= 2:
-        guesses.append("converted from millimetres twice? scale=1000")
-    hint = guesses[0] if guesses else "scale is the metres in one unit of the mesh"
-    raise ValueError(
-        f"the mesh is {extent:.4g} m large; a body is {SMALLEST:g} to {LARGEST:g} m. "
-        f"Give its unit as a factor ({hint})"
-    )
+    require_size("the largest extent of the mesh", extent)
 
 
 def _weld(points: np.ndarray, tolerance: float) -> np.ndarray:

@@ -7,8 +7,10 @@ triangulation. The result is deterministic. (Smoothing made no angle larger.)
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.meshes import Mesh, Points, clean_mesh, face_areas
+from jaxsimp.bodies.meshes import FLAT, Mesh, Points, clean_mesh, face_areas
+from jaxsimp.bodies.size import MOST_PARTICLES, require_size
 from jaxsimp.bodies.topology import Faces, boundary_edges, boundary_loops, distinct_edges
+from jaxsimp.checks import require_count, require_rows
 
 Corners = Float[np.ndarray, "C 2"]
 
@@ -16,7 +18,6 @@ COUNT_TOLERANCE = 0.1
 """Largest relative difference between the requested and the actual number of points."""
 CLEARANCE = 0.6  # distance between lattice and outline, as a fraction of the spacing
 TURN = np.deg2rad(20.0)  # turn of a boundary above which a point is a corner
-FLAT = 1e-3  # largest height of a flat mesh, relative to its extent
 
 
 def mesh_outline(corners: Corners, num_points: int) -> Mesh:
@@ -57,6 +58,9 @@ def mesh_symmetric_outline(
     Raises:
         ValueError: as `mesh_outline`, or if the x of a corner is not as stated for `half`.
     """
+    half = require_rows("half", half, 2)
+    if len(half) < 3:
+        raise ValueError(f"half has {len(half)} corners; give at least 3, two of them at x = 0")
     on_line = half[:, 0] == 0
     if not (on_line[0] and on_line[-1]) or on_line[1:-1].any() or (half[:, 0] < 0).any():
         raise ValueError(
@@ -114,14 +118,12 @@ def check_outline(corners: Corners) -> Corners:
     """The corners of an outline as floats, if it is simple.
 
     Raises:
-        ValueError: if there are fewer than three corners, one is not finite, or the outline
-            crosses or touches itself or encloses nothing.
+        ValueError: if there are fewer than three corners, one is not finite, the outline crosses
+            or touches itself or encloses nothing, or it is too small or too large for a body.
     """
-    corners = np.asarray(corners, dtype=float)
-    if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2:
-        raise ValueError(f"corners has shape {corners.shape}; (C, 2) with C of 3 or more is needed")
-    if not np.isfinite(corners).all():
-        raise ValueError("an outline has a corner that is not finite; give metres")
+    corners = require_rows("corners", corners, 2)
+    if len(corners) < 3:
+        raise ValueError(f"an outline of {len(corners)} corners is given; give at least 3")
     size = np.ptp(corners, axis=0).max()
     twice = np.flatnonzero(_side_lengths(corners) <= 1e-9 * size)
     if twice.size:
@@ -139,6 +141,7 @@ def check_outline(corners: Corners) -> Corners:
             )
     if abs(_signed_area(corners)) <= 1e-9 * size**2:
         raise ValueError("the outline encloses nothing; give corners around an area")
+    require_size("the largest extent of the outline", size)
     return corners
 
 
@@ -147,8 +150,7 @@ def _fill(corners: np.ndarray, num_points: int, *, mirrored: bool) -> tuple[np.n
 
     If `mirrored`, `num_points` includes the mirror images of the points off x = 0.
     """
-    if num_points < 3:
-        raise ValueError(f"{num_points} points are asked for; at least 3 are needed")
+    num_points = require_count("num_points", num_points, 3, MOST_PARTICLES)
     images = 2 if mirrored else 1
     area, around = abs(_signed_area(corners)), _side_lengths(corners).sum()
     # A hexagonal lattice has num = 2 area / (sqrt(3) h^2) + around / (2 h) + 1 points.

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Int
 
 from jaxsimp.bodies.body import Body
 from jaxsimp.bodies.topology import are_among, boundary_edges, distinct_edges, half_edges
+from jaxsimp.checks import require_ids
 
 TAPER = 4.0
 """Distance from the seam beyond which front and back lie a thickness apart at rest, in
@@ -80,8 +81,11 @@ def sew(
 
 def _on_seam(sheet: Body, seam: np.ndarray) -> Bool[np.ndarray, " N"]:
     """Whether each particle is on the seam, if the sheet can be sewn there."""
+    seam = require_ids("seam", seam, sheet.num_particles)
     if not len(seam):
-        raise ValueError("the seam has no edge; front and back must be joined somewhere")
+        raise ValueError(
+            "the seam has no edge; give one or more, pairs of particles on the boundary"
+        )
     inside = seam[~are_among(seam, boundary_edges(sheet.faces)[0])]
     if len(inside):
         raise ValueError(

@@ -6,6 +6,7 @@ The face loads each room at first use, so that `jaxsimp --help` imports none of 
 import math
 import sys
 import time
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -35,7 +36,9 @@ class Options:
     edge lengths of the goal: accurate to about 1 % where creases lie along edges of the
     triangles, otherwise too short by up to a triangle at each crease.
 
-    With --body a goal may also be a mesh file, whose points are the body's, in its order.
+    With --body a goal may also be a mesh file, whose points are the body's, in its order, or an
+    .npy file of positions. Coordinates are in metres with z up: --scale 0.001 takes files in
+    millimetres, --up y files in which y points up.
     Goals of one body are one batch: give --body, or the same rest and faces.
 
     --lower, --upper, --above-table, --fixed-ends and --max-stretch limit the models of ropes
@@ -50,6 +53,10 @@ class Options:
     body: Path | None = None
     """The body at rest: a mesh (OBJ, PLY, STL, OFF, GLB, ...) in metres, or an .npz file with
     rest, and with faces if it is a sheet."""
+    scale: float = 1.0
+    """Metres in one unit of the files, of goals and body: 0.001 for millimetres."""
+    up: str | None = None
+    """Axis of the files that points up: z, y or x; z by default."""
     method: str = "robust"
     """Method: robust, paper (section III-A), or meshlab (the paper's tool, an optional extra)."""
     tolerance: float | None = None
@@ -74,16 +81,21 @@ class Options:
         """Check the options before any computation.
 
         Raises:
-            ValueError: if there is no goal, the method is unknown, the tolerance is not above
-                zero, the workspace is invalid, or a path is not writable or is another file's.
+            ValueError: if there is no goal, the method or the axis is unknown, a number is out of
+                its range, the workspace is invalid, or a path is not writable or is another
+                file's.
         """
+        from jaxsimp.bodies.size import LARGEST, require_scale
+        from jaxsimp.checks import require_choice, require_number
+        from jaxsimp.simplification.key_points import SMALLEST_TOLERANCE
+
         if not self.goals:
             raise ValueError("no goal is given; name at least one file")
-        if self.method not in jaxsimp.METHODS:
-            known = ", ".join(jaxsimp.METHODS)
-            raise ValueError(f"unknown method {self.method!r}; choose from {known}")
-        if self.tolerance is not None and not 0 < self.tolerance < math.inf:
-            raise ValueError(f"tolerance is {self.tolerance:g}; give metres, above zero")
+        require_choice("method", self.method, jaxsimp.METHODS)
+        require_choice("up", self.up or "z", ("x", "y", "z"))
+        require_scale(self.scale)
+        if self.tolerance is not None:
+            require_number("tolerance", self.tolerance, SMALLEST_TOLERANCE, LARGEST, "m")
         self.workspace()
         used = [path.resolve() for path in (*self.goals, self.body) if path]
         for name, path in (("--json", self.json), ("--figure", self.figure)):
@@ -175,8 +187,13 @@ def simplified(options: Options) -> list[SimplifiedGoal]:
     """
     from jaxsimp.goals import load_body, load_goal
 
-    body = load_body(options.body) if options.body else None
-    loaded = [load_goal(path, body) for path in options.goals]
+    scale, up = options.scale, options.up
+    with warnings.catch_warnings(record=True) as hints:
+        warnings.simplefilter("always")
+        body = load_body(options.body, scale=scale, up=up) if options.body else None
+    for hint in hints:
+        Console(stderr=True).print(f"hint: {hint.message}", markup=False, soft_wrap=True)
+    loaded = [load_goal(path, body, scale=scale, up=up or "z") for path in options.goals]
     # Files with equal body definitions are goals of one body.
     batches: dict[tuple[bytes, bytes], list[int]] = {}
     for index, (made, _) in enumerate(loaded):

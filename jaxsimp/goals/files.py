@@ -1,76 +1,106 @@
 """Goals from files: arrays of positions, or meshes whose points are the body's particles."""
 
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jaxsimp.bodies import Body, from_mesh, rope_along
-from jaxsimp.bodies.meshes import load_mesh, read_mesh
-from jaxsimp.goals.check import check_goal
+from jaxsimp.bodies import MATERIALS, Body, from_mesh, rope_along
+from jaxsimp.bodies.mesh_files import load_mesh, read_file, read_mesh
+from jaxsimp.bodies.meshes import z_up
+from jaxsimp.bodies.size import MOST_TRIANGLES, require_scale, require_size
+from jaxsimp.checks import require_whole
+from jaxsimp.goals.check import MAX_STRETCH, NOISE, check_goal
 from jaxsimp.goals.flatten import flatten
 from jaxsimp.goals.shapes import Positions
 
+SPREAD = 8.0
+"""Distance of neighbours above the usual one, in median deviations, that noise explains: 5 are the
+most of 1000 steps of any Gaussian noise."""
+UNEVEN, NO_ORDER = 1.4, 0.7
+"""Longest step over the usual one, and mean step over the mean distance of any two particles: above
+both, particles are in no order. Accordions of a rope reach the second with even steps."""
 
-def load_goal(path: str | Path, body: Body | None = None) -> tuple[Body, Positions]:
+
+class _UnfitError(ValueError):
+    """What is wrong with an array of a file."""
+
+
+def load_goal(
+    path: str | Path, body: Body | None = None, *, scale: float = 1.0, up: str = "z"
+) -> tuple[Body, Positions]:
     """A goal from a file, and its body.
 
     An `.npz` file holds `positions`, shape (N, 3), metres, and may hold `rest`, the rest
-    coordinates, shape (N, 3), or (N, 2) for a flat body, and `faces`, shape (F, 3). A mesh file
-    (OBJ, PLY, OFF, GLB, ...) holds the positions as its points, in the body's order. Points are
-    not welded, so an STL file, which repeats its points, does not match.
+    coordinates, shape (N, 3), or (N, 2) for a flat body, and `faces`, shape (F, 3). An `.npy` file
+    holds positions. A mesh file (OBJ, PLY, OFF, GLB, ...) holds the positions as its points, in the
+    body's order. Points are not welded, so an STL file, which repeats its points, does not match.
 
     Without `body` an `.npz` file defines the body, with default physics. With `faces` it is
     `from_mesh(rest, faces)`; without `rest` it is flat at rest, with the edge lengths of the goal
     (see `jaxsimp.goals.flatten`): accurate to about 1 % of its size where creases lie along edges
     of the triangles, otherwise too short by up to a triangle at each crease. Without `faces` it
     is a rope: at rest along `rest` if given, otherwise straight, evenly spaced by the median
-    distance of neighbours in the goal.
+    distance of neighbours in the goal, which must be in order along the rope.
 
     Args:
         path: path of the file.
         body: body of the goal.
+        scale: metres in one unit of the file: 0.001 for millimetres.
+        up: axis of the file that points up: "z", "y" or "x".
 
     Raises:
         ValueError: if the file cannot be read or lacks an array, or if the body that it defines
             or the goal is invalid (see `check_goal`).
     """
     with _naming(path):
-        if _is_npz(path):
-            arrays = _read_arrays(path, "positions")
-        else:
-            arrays = {"positions": read_mesh(path)[0]}
-            if body is None:
-                raise ValueError("a mesh does not say how it is at rest; give the body too")
-        positions = _rows_of_three("positions", arrays["positions"])
-        if body is not None:
-            return body, check_goal(body, positions)
-        return _with_body(positions, arrays)
+        members = ("positions", "rest", "faces") if body is None else ("positions",)
+        arrays = _scaled(_read(path, members), scale, up)
+        positions = arrays["positions"]
+        if body is None and not _holds_arrays(path):
+            raise ValueError(
+                "a mesh does not say how it is at rest; give the body too (body=, or --body)"
+            )
+        if body is None:
+            return _with_body(positions, arrays)
+        if not _holds_arrays(path) and len(positions) != body.num_particles:
+            raise ValueError(
+                f"it has {len(positions)} points, and the {body.name} has {body.num_particles} "
+                f"particles; a file may repeat points where textures, normals or materials meet, "
+                f"as STL always does: export it as OBJ or PLY, without them"
+            )
+        return body, check_goal(body, positions)
 
 
-def load_body(path: str | Path) -> Body:
+def load_body(path: str | Path, *, scale: float = 1.0, up: str | None = None) -> Body:
     """A body from a file, with default physics.
 
     An `.npz` file holds `rest`, shape (N, 3), or (N, 2) for a flat body, metres, and for a sheet
-    `faces`, shape (F, 3); without `faces` the body is a rope. Any other file is a mesh at rest
-    (OBJ, PLY, STL, OFF, GLB, ...), in metres, which `jaxsimp.bodies.clean_mesh` cleans.
+    `faces`, shape (F, 3); without `faces` the body is a rope, as from an `.npy` file of `rest`. Any
+    other file is a mesh at rest (OBJ, PLY, STL, OFF, GLB, ...), in metres, which
+    `jaxsimp.bodies.clean_mesh` cleans.
 
     Args:
         path: path of the file.
+        scale: metres in one unit of the file: 0.001 for millimetres.
+        up: axis of the file that points up, as for `jaxsimp.load_mesh`.
 
     Raises:
         ValueError: if the file cannot be read or lacks an array, or the body is invalid.
     """
     with _naming(path):
-        if not _is_npz(path):
-            return from_mesh(*load_mesh(path))
-        arrays = _read_arrays(path, "rest")
-        return _body_of(_rows_of_three("rest", arrays["rest"]), arrays)
+        if not _holds_arrays(path):
+            return from_mesh(*load_mesh(path, scale=scale, up=up))
+        arrays = _scaled(_read(path, ("rest", "faces")), scale, up or "z")
+        return _body_of(arrays["rest"], arrays)
 
 
-def _is_npz(path: str | Path) -> bool:
-    return Path(path).suffix.lower() == ".npz"
+def _holds_arrays(path: str | Path) -> bool:
+    return Path(path).suffix.lower() in (".npz", ".npy")
 
 
 @contextmanager
@@ -84,21 +114,76 @@ def _naming(path: str | Path) -> Iterator[None]:
         raise ValueError(message if named else f"{path}: {message}") from error
 
 
-def _read_arrays(path: str | Path, needed: str) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz` file that define a goal or a body."""
+def _read(path: str | Path, members: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Those arrays of a file that it has; the first is needed."""
+    needed = members[0]
+    if not _holds_arrays(path):
+        return {needed: read_mesh(path)[0]}
+    remedy = f"an .npz file, written with np.savez(path, {needed}={needed})"
+    data = BytesIO(read_file(path, remedy))
+    if Path(path).suffix.lower() == ".npy":
+        return {needed: _read_array(needed, data)}
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ("positions", "rest", "faces") if name in file}
-    except Exception as error:  # np.load raises many kinds of errors on a broken file
-        raise ValueError(
-            f"it cannot be read as .npz ({type(error).__name__}: {error}); write it with "
-            f"np.savez(path, {needed}={needed})"
-        ) from error
+        with zipfile.ZipFile(data) as archive:
+            names = archive.namelist()
+            held = [name for name in members if f"{name}.npy" in names]
+            # The header says how large an array is before it is unpacked.
+            arrays = {}
+            for name in held:
+                with archive.open(f"{name}.npy") as member:
+                    arrays[name] = _read_array(name, member)
+    except _UnfitError:
+        raise
+    except Exception as error:  # the readers raise many kinds of errors on a broken file
+        raise ValueError(f"it is damaged, or is no .npz file; give {remedy}") from error
     if needed not in arrays:
-        raise ValueError(
-            f"it has no array {needed!r}; write it with np.savez(path, {needed}={needed})"
-        )
+        told = ", ".join(name.removesuffix(".npy") for name in names[:8]) or "none"
+        raise ValueError(f"it has no array {needed!r} (it has {told}); give {remedy}")
     return arrays
+
+
+def _read_array(name: str, file: Any) -> np.ndarray:
+    """An array in NumPy's format, if its header says that it holds not too many numbers."""
+    header = BytesIO(file.read(2**16))
+    try:
+        version = np.lib.format.read_magic(header)
+        read = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version]
+        shape, in_columns, dtype = read(header)
+    except Exception as error:  # the reader raises many kinds of errors
+        raise _UnfitError(
+            f"{name} is no array in NumPy's format; write it with np.savez(path, {name}={name})"
+        ) from error
+    if dtype.kind not in "fiu":
+        raise _UnfitError(f"{name} is of {dtype}; give an array of real numbers")
+    count = int(np.prod(shape, dtype=object))
+    if count > 3 * MOST_TRIANGLES:
+        raise _UnfitError(
+            f"{name} has shape {shape}; a body has {MOST_TRIANGLES // 2} particles at most: "
+            f"give fewer"
+        )
+    rest = count * dtype.itemsize - (len(header.getvalue()) - header.tell())
+    held = header.read() + (file.read(rest) if rest > 0 else b"")
+    if len(held) < count * dtype.itemsize:
+        raise _UnfitError(f"{name} is cut short; write the file again")
+    array = np.frombuffer(held, dtype, count)
+    return array.reshape(shape, order="F" if in_columns else "C")
+
+
+def _scaled(arrays: dict[str, np.ndarray], scale: float, up: str) -> dict[str, np.ndarray]:
+    """Coordinates as floats in metres, z up, and triangles as whole numbers."""
+    scale = require_scale(scale)
+    made = {}
+    for name, array in arrays.items():
+        if name == "faces":
+            made[name] = require_whole(name, array)
+        elif name == "rest" and array.ndim == 2 and array.shape[1] == 2:
+            made[name] = scale * _rows_of_three(name, _in_three(array))
+        else:
+            made[name] = scale * z_up(_rows_of_three(name, array), up)
+    return made
 
 
 def _with_body(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> tuple[Body, Positions]:
@@ -117,15 +202,15 @@ def _with_body(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> tuple[Bo
 
 def _body_of(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> Body:
     """The body that a file defines."""
-    rest = _rows_of_three("rest", arrays["rest"]) if "rest" in arrays else None
+    rest = arrays.get("rest")
     if rest is not None and len(rest) != len(positions):
-        raise ValueError(f"rest has {len(rest)} rows and positions has {len(positions)}")
+        raise ValueError(
+            f"rest has {len(rest)} rows and positions has {len(positions)}; give one row for each "
+            f"particle in both"
+        )
     if "faces" not in arrays:
         return rope_along(_straight(positions) if rest is None else rest)
     faces = arrays["faces"]
-    if not np.issubdtype(faces.dtype, np.integer):
-        raise ValueError(f"faces is of {faces.dtype}; whole numbers are needed, ids of particles")
-    faces = faces.astype(np.int64)
     if rest is None:
         rest = _in_three(flatten(positions, faces))
     body = from_mesh(rest, faces)
@@ -138,11 +223,7 @@ def _body_of(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> Body:
 
 
 def _rows_of_three(name: str, array: np.ndarray) -> np.ndarray:
-    """Coordinates as floats, with z = 0 for flat rest coordinates."""
-    if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
-        raise ValueError(f"{name} is of {array.dtype}; real numbers are needed, in metres")
-    if name == "rest" and array.ndim == 2 and array.shape[1] == 2:
-        array = _in_three(array)
+    """Coordinates as floats."""
     if array.ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"{name} has shape {array.shape}; one row of x, y, z a particle is needed")
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
@@ -162,12 +243,42 @@ def _in_three(flat: np.ndarray) -> np.ndarray:
 def _straight(positions: np.ndarray) -> np.ndarray:
     """A straight rope along x with the median distance of a goal's neighbours."""
     if len(positions) < 2:
-        raise ValueError(f"positions has {len(positions)} rows; a rope has at least 2 particles")
-    spacing = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+        raise ValueError(
+            f"positions has {len(positions)} rows; a rope has at least 2 particles: give more, or "
+            f"add faces"
+        )
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    spacing = np.median(steps)
     if not spacing > 0:
         raise ValueError(
             f"the median distance of neighbours in positions is {spacing:g} m; give particles "
             f"that are apart, in order along the rope"
         )
+    require_size("the largest extent of positions", np.ptp(positions, axis=0).max(), smallest=0.0)
+    _check_order(positions, steps)
     x = spacing * np.arange(len(positions))
     return np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
+
+
+def _check_order(positions: np.ndarray, steps: np.ndarray) -> None:
+    """Raise a `ValueError` for particles that are not in order along an evenly spaced rope.
+
+    Steps between neighbours are even, up to creases, which shorten them, to noise, and to a lift
+    over another part of the rope. Without an order neighbours are as far apart as any two.
+    """
+    from scipy.spatial.distance import pdist
+
+    usual, longest = float(np.median(steps)), int(steps.argmax())
+    noise = SPREAD * float(np.median(np.abs(steps - usual)))
+    noise += NOISE * float(np.ptp(positions, axis=0).max()) + MATERIALS["rope"].thickness
+    jumps = steps[longest] > MAX_STRETCH * usual + noise
+    some = np.linspace(0, len(positions) - 1, min(len(positions), 500)).round().astype(int)
+    any_two = float(pdist(positions[some]).mean())
+    lost = steps.mean() > NO_ORDER * any_two and steps[longest] > UNEVEN * usual
+    if jumps or lost:
+        raise ValueError(
+            f"positions are in no order along a rope: particles {longest} and {longest + 1} are "
+            f"{steps[longest]:.3g} m apart, neighbours usually {usual:.3g} m, any two particles "
+            f"{any_two:.3g} m. Add faces for a sheet, rest for a rope with uneven particles, or "
+            f"give the body (body=, or --body)"
+        )

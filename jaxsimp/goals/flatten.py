@@ -11,7 +11,8 @@ with a decreasing scale).
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.meshes import LARGEST, WELD
+from jaxsimp.bodies.meshes import WELD
+from jaxsimp.bodies.size import require_size
 from jaxsimp.bodies.topology import (
     Faces,
     connected_pieces,
@@ -19,6 +20,7 @@ from jaxsimp.bodies.topology import (
     half_edges,
     inner_edges,
 )
+from jaxsimp.checks import require_ids
 from jaxsimp.goals.shapes import Positions
 
 SCALES = (1.0, 0.3, 0.1)
@@ -100,11 +102,7 @@ def _edges_of_disc(faces: np.ndarray, num_points: int) -> Int[np.ndarray, "E 2"]
 def _check_extent(positions: np.ndarray) -> None:
     """Raise a `ValueError` for a goal that is too large for a sheet, or on a line."""
     extent = float(np.ptp(positions, axis=0).max())
-    if extent > LARGEST:
-        raise ValueError(
-            f"positions extend over {extent:.4g} m; a body is at most {LARGEST:g} m large. Give "
-            f"them in metres"
-        )
+    require_size("the largest extent of positions", extent, smallest=0.0)
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
     if spread[1] <= WELD * spread[0]:
         raise ValueError("all particles lie on a line; add rest, or give the body")
@@ -114,11 +112,7 @@ def _check_ids(faces: np.ndarray, num_points: int) -> None:
     """Raise a `ValueError` for triangles with wrong shape, unknown points, or a point twice."""
     if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
         raise ValueError(f"faces has shape {faces.shape}; a row of three is needed for each")
-    if faces.min() < 0 or faces.max() >= num_points:
-        wrong = faces.max() if faces.max() >= num_points else faces.min()
-        raise ValueError(
-            f"a triangle names point {wrong}; {num_points} points have ids 0 to {num_points - 1}"
-        )
+    require_ids("a triangle", faces, num_points, "points")
     if (np.diff(np.sort(faces, axis=1), axis=1) == 0).any():
         raise ValueError("a triangle names a point twice; leave it out of faces")
 

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.garments import Garment
 from jaxsimp.bodies.topology import boundary_edges, half_edges
-from jaxsimp.goals.shapes import Positions, flat
+from jaxsimp.checks import as_reals, require_rows
+from jaxsimp.goals.shapes import Positions, flat, require_flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +70,15 @@ def fold(
             layers; all by default.
 
     Raises:
-        ValueError: if the direction has no length, or the line is not finite.
+        ValueError: if the direction has no length, the line is not finite, `part` is no mask of
+            the particles, or the body is not flat at rest and not in `positions` either.
     """
-    direction = np.asarray(direction, dtype=float)
+    point, direction = _two("point", point), _two("direction", direction)
     norm = np.linalg.norm(direction)
     if not 0 < norm < np.inf:
         raise ValueError(f"direction is {direction.tolist()}; give a finite vector with a length")
-    point = np.asarray(point, dtype=float)
-    if not np.isfinite(point).all():
-        raise ValueError(f"point is {point.tolist()}; give finite coordinates in metres")
+    positions = _check_positions(body, positions)
+    part = None if part is None else _check_part(body, part)
     left = np.array([-direction[1], direction[0]]) / norm
     distance = (positions[:, :2] - point) @ left
     # A particle whose distance from the line is only rounding is on the crease.
@@ -93,6 +94,39 @@ def fold(
     z = positions[:, 2]
     folded[:, 2] = np.select([moves, creases], [lowest + z[moves].max() - z, z + body.radius], z)
     return folded
+
+
+def _two(name: str, values: object) -> np.ndarray:
+    """Finite x and y."""
+    reals = as_reals(values)
+    if reals is None or reals.shape != (2,) or not np.isfinite(reals).all():
+        told = values.tolist() if isinstance(values, np.ndarray) else values
+        raise ValueError(f"{name} is {told}; give finite coordinates x and y, in metres")
+    return reals
+
+
+def _check_positions(body: Body, positions: object) -> np.ndarray:
+    """Positions of the body that can be folded: it lies flat at rest, or lower than at rest."""
+    rows, count = require_rows("positions", positions, 3), body.num_particles
+    if len(rows) != count:
+        raise ValueError(
+            f"positions has {len(rows)} rows; give one for each of {count} particles of the "
+            f"{body.name}"
+        )
+    if np.ptp(rows[:, 2]) > np.ptp(body.rest[:, 2]) / 2:
+        require_flat(body)
+    return rows
+
+
+def _check_part(body: Body, part: object) -> np.ndarray:
+    """A mask of the particles."""
+    mask, count = np.asarray(part), body.num_particles
+    if mask.shape != (count,) or mask.dtype != bool:
+        raise ValueError(
+            f"part is an array of {mask.dtype}, shape {mask.shape}; give true or false for each of "
+            f"{count} particles"
+        )
+    return mask
 
 
 def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
@@ -132,9 +166,7 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
             _fold_about((a * x / 2, b * y / 2), (b, -a))
             for a, b in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
         )
-    raise ValueError(
-        f"fold is {name!r}; choose one of side, diagonal, quarter, letter, four_corners"
-    )
+    raise ValueError(f"fold is {name!r}; choose from side, diagonal, quarter, letter, four_corners")
 
 
 def sleeves_in(shirt: Garment) -> tuple[Fold, Fold]:
@@ -196,9 +228,16 @@ def _fold_about(point: tuple[float, float], direction: tuple[float, float]) -> F
 
 def _places(garment: Garment, *names: str) -> list[np.ndarray]:
     """Positions on the table of landmarks of a garment at rest."""
+    if not isinstance(garment, Garment):
+        raise ValueError(
+            f"a {type(garment).__name__} is given; give a jaxsimp.Garment, which names parts of "
+            f"its body: that of js.t_shirt or js.trousers, or of an own mesh "
+            f"Garment(body, landmarks, mirror, opposite)"
+        )
     missing = [name for name in names if name not in garment.landmarks]
     if missing:
         raise ValueError(
-            f"the {garment.body.name} has no {missing[0]}; it has {', '.join(garment.landmarks)}"
+            f"the {garment.body.name} has no {missing[0]}; it has "
+            f"{', '.join(garment.landmarks) or 'no landmarks'}: add it, or use goals.fold"
         )
     return [garment.body.rest[garment.landmarks[name], :2] for name in names]

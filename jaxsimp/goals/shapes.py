@@ -4,18 +4,46 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body
+from jaxsimp.bodies.size import LARGEST
+from jaxsimp.checks import require_choice, require_number, require_rows
 
 Positions = Float[np.ndarray, "N 3"]
+BUMPS = 0.05
+"""Largest height of a flat body, besides two of its thickness, relative to its size."""
 
 
 def flat(body: Body, angle: float = 0.0) -> Positions:
     """The body at rest, flat on the table and turned by `angle` about z, shape (N, 3).
 
     Args:
-        body: any body.
+        body: a body that is flat at rest, of one layer or two.
         angle: rotation about the vertical through the origin, radians.
+
+    Raises:
+        ValueError: if the body is not flat at rest, or the angle no number.
     """
+    require_flat(body)
     return turn(body.rest + np.array([0.0, 0.0, body.radius]), angle)
+
+
+def require_flat(body: Body) -> None:
+    """Raise a `ValueError` for a body that is not flat at rest."""
+    height = float(np.ptp(body.rest[:, 2]))
+    if height > 2 * body.material.thickness + BUMPS * body.size:
+        raise ValueError(
+            f"the {body.name} is {height:.3g} m high at rest, and does not lie flat. Let it fall "
+            f"flat in a simulation (jaxsimp.settle) and go on from those positions; as it "
+            f"stands it is at body.rest + [0, 0, body.radius]"
+        )
+
+
+def require_rope(body: Body) -> None:
+    """Raise a `ValueError` for a body with triangles."""
+    if len(body.faces):
+        raise ValueError(
+            f"the {body.name} has {len(body.faces)} triangles; only a rope is laid along a line: "
+            f"see goals.fold for sheets"
+        )
 
 
 def turn(positions: Positions, angle: float) -> Positions:
@@ -24,7 +52,12 @@ def turn(positions: Positions, angle: float) -> Positions:
     Args:
         positions: shape (N, 3), metres.
         angle: counter-clockwise seen from above, radians.
+
+    Raises:
+        ValueError: if an array or a number is none.
     """
+    angle = require_number("angle", angle, -1e6, 1e6, "radians")
+    positions = require_rows("positions", positions, 3)
     cos, sin = np.cos(angle), np.sin(angle)
     return positions @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -40,10 +73,11 @@ def polyline(body: Body, corners: Float[np.ndarray, "M 2"]) -> Positions:
         corners: x and y of the corners in order, at least two, metres.
 
     Raises:
-        ValueError: if the polyline has fewer than two corners or no length.
+        ValueError: if the body is no rope, or the polyline has fewer than two corners or no length.
     """
-    corners = np.asarray(corners, dtype=float)
-    if corners.ndim != 2 or corners.shape[0] < 2 or corners.shape[1] != 2:
+    require_rope(body)
+    corners = require_rows("corners", corners, 2)
+    if len(corners) < 2:
         raise ValueError(f"corners has shape {corners.shape}; (M, 2) with M of 2 or more is needed")
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     if not 0 < arc[-1] < np.inf:
@@ -59,8 +93,12 @@ def straight(body: Body, length: float | None = None) -> Positions:
     Args:
         body: a rope.
         length: distance of the ends, metres; the rest length by default.
+
+    Raises:
+        ValueError: if the body is no rope, or the length none.
     """
-    half = (body.size if length is None else length) / 2
+    length = body.size if length is None else require_number("length", length, 1e-3, LARGEST, "m")
+    half = length / 2
     return polyline(body, np.array([[-half, 0.0], [half, 0.0]]))
 
 
@@ -75,10 +113,10 @@ def letter(body: Body, name: str, slack: float = 0.0) -> Positions:
         slack: fraction of the rest length by which the letter is shorter than the rope, below 1.
 
     Raises:
-        ValueError: if the letter is unknown, or the slack is not from 0 to below 1.
+        ValueError: if the body is no rope, the letter is unknown, or the slack is not from 0 to
+            below 1.
     """
-    if name not in _LETTERS:
-        raise ValueError(f"letter is {name!r}; choose one of {', '.join(_LETTERS)}")
+    require_choice("letter", name, _LETTERS)
     return _laid_along(body, _LETTERS[name](), slack)
 
 
@@ -91,10 +129,10 @@ def crossed_triangle(body: Body, slack: float = 0.0, tail: float = 0.5) -> Posit
         tail: length of an end beyond the crossing, as a multiple of the triangle's side.
 
     Raises:
-        ValueError: if the slack is not from 0 to below 1, or the tail not above zero.
+        ValueError: if the body is no rope, the slack is not from 0 to below 1, or the tail not
+            above zero.
     """
-    if not 0 < tail < np.inf:
-        raise ValueError(f"tail is {tail:g}; give a length above zero, over the triangle's side")
+    tail = require_number("tail", tail, 1e-3, 1e3, "times the triangle's side")
     left, right, top = np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, np.sqrt(3) / 2]])
     ends = [top + tail * (top - corner) for corner in (right, left)]
     line = np.stack([ends[0], right, left, ends[1]])
@@ -110,7 +148,12 @@ def lift_crossings(body: Body, positions: Positions) -> Positions:
     Args:
         body: a rope.
         positions: shape (N, 3), metres.
+
+    Raises:
+        ValueError: if the body is no rope.
     """
+    require_rope(body)
+    positions = require_rows("positions", positions, 3)
     lifted = positions.copy()
     index = np.arange(len(positions))
     steps = np.diff(positions[:, :2], axis=0)
@@ -141,10 +184,8 @@ def lift_crossings(body: Body, positions: Positions) -> Positions:
 
 def _laid_along(body: Body, line: np.ndarray, slack: float) -> Positions:
     """A rope along a line of any size, scaled to the rope's length and centred."""
-    if not 0 <= slack < 1:
-        raise ValueError(
-            f"slack is {slack:g}; give a fraction of the rest length, from 0 to below 1"
-        )
+    require_rope(body)
+    slack = require_number("slack", slack, 0.0, 0.999, "of the rest length")
     length = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
     # Rest lengths between neighbours: a rope at rest may be curved.
     rest_length = np.linalg.norm(np.diff(body.rest, axis=0), axis=1).sum()

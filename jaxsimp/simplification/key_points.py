@@ -1,11 +1,14 @@
 """Key points: the particles of a body that the model of a goal keeps, as candidates to grasp."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from jaxsimp.checks import require_ids
 
 
 class FitStatus(IntEnum):
@@ -23,7 +26,8 @@ class KeyPoints:
     A model is piecewise linear in rest coordinates: particles at `W positions`, where row `i` of
     `W` interpolates between the key points around the rest coordinates of particle `i` (see
     interpolation.py). `max_error` and `rms_error` are thus defined alike for ropes and surfaces;
-    `errors` are in the norm by which the method chooses.
+    `errors` are in the norm by which the method chooses. Arrays are copied, and read-only, also
+    after unpickling.
 
     Attributes:
         particles: ids of the key points in ascending order, shape (K,).
@@ -41,6 +45,10 @@ class KeyPoints:
         certified: whether a proof exists that no model with fewer key points fits.
         status: `FITS`, or the reason why no model fits. With `NO_FIT` the model is one of those
             tried (see the method); with `INFEASIBLE` there are no key points.
+
+    Raises:
+        ValueError: if `particles` are no ids of the body's particles, or another array does not
+            fit to them.
     """
 
     particles: Int[np.ndarray, " K"]
@@ -55,6 +63,23 @@ class KeyPoints:
     rms_error: float
     certified: bool = False
     status: FitStatus = FitStatus.FITS
+
+    def __post_init__(self) -> None:
+        require_ids("particles", self.particles, self.num_particles)
+        require_ids("elements", self.elements, len(self.particles), "key points")
+        if np.shape(self.positions) != (len(self.particles), 3):
+            raise ValueError(
+                f"positions has shape {np.shape(self.positions)}; give x, y, z for each of "
+                f"{len(self.particles)} key points"
+            )
+        for name in ("particles", "positions", "elements"):
+            own = np.array(getattr(self, name))
+            own.flags.writeable = False
+            object.__setattr__(self, name, own)
+
+    def __reduce__(self) -> tuple[type["KeyPoints"], tuple[Any, ...]]:
+        """Make copies with the constructor, since pickled arrays lose their read-only flag."""
+        return type(self), tuple(getattr(self, field.name) for field in fields(self))
 
     def __len__(self) -> int:
         return len(self.particles)
@@ -72,6 +97,8 @@ class KeyPoints:
         return self.errors[self.sizes.index(len(self))]
 
 
+SMALLEST_TOLERANCE = 1e-9
+"""Smallest tolerance, metres: below it rounding decides."""
 SIZES_BEYOND = 3
 """Number of sizes tried after the first that fits."""
 

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body
+from jaxsimp.checks import require_choice
 from jaxsimp.goals import Positions, as_goal
 from jaxsimp.simplification.key_points import FitStatus, KeyPoints
 from jaxsimp.simplification.ropes.fit import Workspace, why_infeasible
@@ -50,10 +51,16 @@ def simplify_batch(
         ValueError: if the method is unknown, a goal does not fit the body, a number is out of
             range, or a workspace is given for a surface.
     """
-    if method not in METHODS:
-        raise ValueError(f"method is {method!r}; choose one of {', '.join(METHODS)}")
+    require_choice("method", method, METHODS)
+    if np.ndim(goals) == 2:
+        raise ValueError(
+            f"goals has shape {np.shape(goals)}; give a batch, shape (B, N, 3), or call simplify "
+            f"with one goal"
+        )
     checked = [as_goal(body, goal) for goal in goals]
     simplify_ropes, simplify_surfaces = METHODS[method]
+    if workspace is not None and not isinstance(workspace, Workspace):
+        raise ValueError(f"workspace is {workspace!r}; give a jaxsimp.Workspace")
     if workspace is not None and len(body.faces):
         raise ValueError(
             f"a workspace (lower, upper, above_table, fixed_ends, max_stretch) is given, and "
@@ -89,7 +96,7 @@ def simplify(
     Raises:
         ValueError: as for `simplify_batch`, or if no model fits or lies within the workspace.
     """
-    goals = np.asarray(goal)[None]
+    goals = as_goal(body, goal)[None]
     (points,) = simplify_batch(
         body, goals, method=method, tolerance=tolerance, max_size=max_size, workspace=workspace
     )

@@ -26,14 +26,14 @@ def strip(**options):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", [-0.5, NAN, INF])
 def test_a_value_that_no_material_has_is_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name} is {value:g}; give a finite number"):
+    with pytest.raises(ValueError, match=f"{name} is {value}; give a number from .* to "):
         MATERIALS["cloth"].changed(**{name: value})
 
 
 def test_zero_is_refused_as_a_density_only():
     for name in NAMES[1:]:
         assert getattr(MATERIALS["cloth"].changed(**{name: 0.0}), name) == 0.0
-    with pytest.raises(ValueError, match="density is 0; give a finite number above zero"):
+    with pytest.raises(ValueError, match=r"density is 0.0; give a number from 1e-06 to"):
         MATERIALS["cloth"].changed(density=0.0)
 
 
@@ -133,7 +133,7 @@ def test_springs_have_the_stiffness_of_their_family(make):
 # --- density and mass ----------------------------------------------------------------------------
 
 
-@given(length=st.floats(0.05, 2.0), density=st.floats(0.01, 1.0))
+@given(length=st.floats(0.05, 1.2), density=st.floats(0.01, 1.0))
 def test_the_mass_of_a_rope_is_its_density_times_its_length(length, density):
     zigzag = np.zeros((5, 3))
     zigzag[:, 0], zigzag[1::2, 1] = np.arange(5) * length, length

@@ -208,8 +208,12 @@ def test_remesh_refuses(make, message):
         ([[0, 0], [1, 0], [2, 0]], "crosses or touches itself"),
         ([[0, 0], [0, 0], [0, 0]], "corner 0 is there twice in a row"),
         ([[0, 0], [1, 0], [0.5, 4e-10]], "crosses or touches itself|encloses nothing"),
-        ([[0, 0], [1, 0], [np.nan, 1]], "corner that is not finite"),
-        ([[0, 0], [1, 0]], r"corners has shape \(2, 2\)"),
+        (
+            [[0, 0], [1, 0], [np.nan, 1]],
+            r"corners\[2\] is \[nan, 1.0\] .*give finite numbers",
+        ),
+        (1000 * SQUARE, r"outline is \d+ m; a body is 0.01 to 5 m large.*millimetres\?"),
+        ([[0, 0], [1, 0]], "an outline of 2 corners is given; give at least 3"),
     ],
 )
 def test_an_outline_is_refused(corners, message):
@@ -218,7 +222,7 @@ def test_an_outline_is_refused(corners, message):
 
 
 def test_too_few_points_and_too_narrow_parts_are_refused():
-    with pytest.raises(ValueError, match="2 points are asked for; at least 3"):
+    with pytest.raises(ValueError, match="num_points is 2; give a whole number from 3 to 250000"):
         mesh_outline(SQUARE, 2)
     angle = np.linspace(0, 2 * np.pi, 100, endpoint=False)
     disc = 0.3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)

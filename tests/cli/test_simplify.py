@@ -292,6 +292,28 @@ def test_the_picture_shows_models_and_errors_beside_each_other(
     assert (tmp_path / "goals.png").exists()
 
 
+def test_files_of_another_unit_and_axis_are_taken_with_their_options(tmp_path, capsys):
+    small = cloth((5, 5))
+    stored = 1000 * small.rest[:, [0, 2, 1]] * np.array([1.0, 1.0, -1.0])
+    for name in ("body.obj", "goal.obj"):
+        trimesh.Trimesh(stored, small.faces, process=False).export(tmp_path / name)
+    out = tmp_path / "out.json"
+    files = (tmp_path / "goal.obj", "--body", tmp_path / "body.obj", "--json", out)
+    told = refused(capsys, tmp_path, *files)
+    assert "body.obj: the largest extent of the mesh is 300 m" in told
+    assert "millimetres? scale=0.001" in told
+    assert command(*files, "--scale", "0.001") == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"hint: {tmp_path / 'body.obj'} is flat and stands on edge, 0.3 m high")
+    assert "under the table" in told
+    assert command(*files, "--scale", "0.001", "--up", "y") == 0
+    assert capsys.readouterr().err == ""
+    wanted = jaxsimp.simplify(small, small.rest)
+    assert json.loads(out.read_text())["key_points"] == wanted.particles.tolist()
+    assert "up is 'w'; choose from x, y, z" in refused(capsys, tmp_path, *files, "--up", "w")
+    assert "scale is 0.0; give a number" in refused(capsys, tmp_path, *files, "--scale", "0")
+
+
 # --- refusals ------------------------------------------------------------------------------------
 
 
@@ -310,9 +332,15 @@ def changed(index, value):
 
 
 WRONG = {
-    "missing": (lambda path: None, "cannot be read as .npz (FileNotFoundError"),
-    "text": (lambda path: path.write_text("positions"), "cannot be read as .npz"),
-    "empty": (npz(goal=DIAGONAL), "it has no array 'positions'; write it with np.savez"),
+    "missing": (
+        lambda path: None,
+        "there is no such file; give an .npz file, written with np.savez",
+    ),
+    "text": (lambda path: path.write_text("positions"), "it is damaged, or is no .npz file"),
+    "empty": (
+        npz(goal=DIAGONAL),
+        "it has no array 'positions' (it has goal); give an .npz file",
+    ),
     "nan": (changed((7, 1), np.nan), "positions of particle 7 is"),
     "count": (
         npz(positions=DIAGONAL[:-1], rest=CLOTH.rest, faces=CLOTH.faces),
@@ -360,10 +388,10 @@ def test_a_goal_of_another_count_than_the_body_is_refused(letters, tmp_path, cap
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("body.obj", "body.obj has no triangles; give a file with the triangles of a surface"),
+        ("body.obj", "body.obj cannot be read as a mesh: it has no points ('v x y z'), or is no"),
         ("body.xyz", "body.xyz cannot be read as a mesh"),
-        ("body.npz", "body.npz: it cannot be read as .npz"),
-        ("missing.ply", "missing.ply cannot be read as a mesh"),
+        ("body.npz", "body.npz: it is damaged, or is no .npz file; give an .npz file, written"),
+        ("missing.ply", "missing.ply cannot be read as a mesh: there is no such file"),
     ],
 )
 def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys):
@@ -375,11 +403,11 @@ def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--method", "best"), "unknown method 'best'; choose from robust, paper"),
-        (("--tolerance", "0"), "tolerance is 0; give metres, above zero"),
-        (("--tolerance", "-1e-3"), "tolerance is -0.001; give metres, above zero"),
-        (("--tolerance", "nan"), "tolerance is nan; give metres, above zero"),
-        (("--max-stretch", "-0.1"), "max_stretch is -0.1; give a finite number, zero or more"),
+        (("--method", "best"), "method is 'best'; choose from robust, paper"),
+        (("--tolerance", "0"), "tolerance is 0.0; give a number from 1e-09 to 5 m"),
+        (("--tolerance", "-1e-3"), "tolerance is -0.001; give a number from"),
+        (("--tolerance", "nan"), "tolerance is nan; give a number from"),
+        (("--max-stretch", "-0.1"), "max_stretch is -0.1; give a number from 0 to 10 of the"),
         (("--lower", "0", "0", "1", "--upper", "1", "1", "0"), "give an upper bound above the"),
         (("--json", "none/out.json"), "none is no folder; make it, or give another --json"),
         (("--figure", "none/out.png"), "none is no folder; make it, or give another --figure"),
@@ -397,7 +425,9 @@ def test_wrong_options_are_refused(options, message, letters, tmp_path, capsys, 
 
 
 def test_a_refusal_is_one_line_whatever_the_path(tmp_path, capsys):
-    assert "two lines.npz: it cannot" in refused(capsys, tmp_path, tmp_path / "two\nlines.npz")
+    assert "two lines.npz: there is no such file" in refused(
+        capsys, tmp_path, tmp_path / "two\nlines.npz"
+    )
 
 
 def test_no_goal_is_refused(tmp_path, capsys):

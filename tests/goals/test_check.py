@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth, from_mesh, rope
 from jaxsimp.bodies.garments import t_shirt
-from jaxsimp.goals.check import NOISE
+from jaxsimp.goals.check import NOISE, SQUEEZED
 
 CLOTH = cloth((6, 5), (0.3, 0.2))
 SHIRT = t_shirt(num_particles=200).body
@@ -47,7 +47,7 @@ def test_check_goal_names_the_first_particle_that_is_not_finite(bad):
 def test_as_goal_refuses_the_same_shapes_and_lets_a_stretched_body_in():
     with pytest.raises(ValueError, match=r"goal has shape \(30, 2\)"):
         goals.as_goal(CLOTH, np.zeros((30, 2)))
-    far = 100 * goals.flat(CLOTH) - 1.0
+    far = 10 * goals.flat(CLOTH) - 1.0  # the cloth stretched tenfold, a metre under the table
     np.testing.assert_array_equal(goals.as_goal(CLOTH, far), far)
 
 
@@ -80,7 +80,13 @@ def test_a_body_that_is_crumpled_or_squeezed_is_let_in(seed, share):
         turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
         goal = body.rest @ turn * np.array([1.0, share, share])
         goal[:, 2] -= goal[:, 2].min()
-        goals.check_goal(body, goal)
+        edges = body.springs[body.families == 0]
+        lengths = np.linalg.norm(goal[edges[:, 1]] - goal[edges[:, 0]], axis=1)
+        if lengths.sum() > 1.01 * SQUEEZED * body.rest_length[body.families == 0].sum():
+            goals.check_goal(body, goal)
+        else:
+            with pytest.raises(ValueError, match=r"have .* of their length at rest; 0.1 is the"):
+                goals.check_goal(body, 0.98 * goal)
 
 
 def test_a_stretch_that_pickers_may_make_is_let_in():
@@ -92,7 +98,7 @@ def test_a_stretch_that_pickers_may_make_is_let_in():
 
 
 @pytest.mark.parametrize("body", [CLOTH, SHIRT, rope()], ids=["cloth", "shirt", "rope"])
-@given(ratio=st.floats(1.4, 1000.0))
+@given(ratio=st.floats(1.4, 9.0))
 def test_a_stretched_body_is_refused_with_the_pair(body, ratio):
     with pytest.raises(ValueError, match=r"in the goal particles \d+ and \d+ are") as refused:
         goals.check_goal(body, goals.flat(body) * [ratio, ratio, 1.0])
@@ -122,7 +128,7 @@ def test_particles_in_another_order_are_refused():
         goals.check_goal(body, goals.flat(body)[order])
 
 
-@given(depth=st.floats(1.01 * NOISE * 0.3, 10.0), particle=st.integers(0, 29))
+@given(depth=st.floats(1.01 * NOISE * 0.3, 0.8), particle=st.integers(0, 29))
 def test_a_particle_under_the_table_is_named(depth, particle):
     goal = goals.flat(CLOTH)
     goal[particle, 2] = -depth

@@ -246,7 +246,7 @@ def test_a_sequence_goes_on_from_given_positions():
 
 
 def test_named_folds_refuse():
-    with pytest.raises(ValueError, match=r"fold is 'book'; choose one of side, diagonal"):
+    with pytest.raises(ValueError, match=r"fold is 'book'; choose from side, diagonal"):
         goals.rectangle_folds(CLOTH, "book")
     with pytest.raises(
         ValueError, match=r"cloth is 0\.3 m by 0\.2 m; only the corners of a square"

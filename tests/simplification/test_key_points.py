@@ -1,4 +1,8 @@
+import pickle
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from jaxsimp.simplification import KeyPoints
 from jaxsimp.simplification.key_points import SIZES_BEYOND, smallest_fit
@@ -24,6 +28,36 @@ def test_mask_is_true_exactly_at_the_key_particles():
     assert key_points([0, 3, 5]).mask.tolist() == [True, False, False, True, False, True]
     assert not key_points([]).mask.any()
     assert key_points(range(6)).mask.all()
+
+
+def test_arrays_are_its_own_and_read_only_also_after_unpickling():
+    particles = np.array([0, 3])
+    points = replace(key_points([0, 3]), particles=particles)
+    particles[0] = 5
+    for each in (points, pickle.loads(pickle.dumps(points))):
+        assert each.particles.tolist() == [0, 3]
+        with pytest.raises(ValueError, match="read-only"):
+            each.particles[0] = 5
+        assert each.mask.sum() == 2
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"particles": np.array([0, 6])}, "particles names 6; the ids of 6 particles are 0 to 5"),
+        ({"particles": np.array([-1, 3])}, "particles names -1"),
+        ({"particles": np.array([0.0, 3.0])}, "particles is an array of float64, shape .2,.; give"),
+        ({"elements": np.array([[0, 2]])}, "elements names 2; the ids of 2 key points are 0 to 1"),
+        (
+            {"positions": np.zeros((3, 3))},
+            r"positions has shape \(3, 3\); give x, y, z for each of 2",
+        ),
+    ],
+)
+def test_particles_are_ids_of_the_body(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(key_points([0, 3]), **changes)
 
 
 def test_length_is_the_number_of_key_points():

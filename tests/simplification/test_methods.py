@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from jaxsimp import goals
 from jaxsimp.bodies import cloth, rope
@@ -87,3 +89,70 @@ def test_a_workspace_of_a_surface_is_refused(method):
         simplify(CLOTH, CLOTH.rest, method=method, workspace=TABLE)
     with pytest.raises(ValueError, match=told):
         simplify_batch(CLOTH, np.zeros((0, 81, 3)), method=method, workspace=TABLE)
+
+
+# --- what is no goal, and no option --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", ["robust", "paper"])
+@pytest.mark.parametrize("body", [rope(5), cloth((5, 5))], ids=["rope", "cloth"])
+def test_a_goal_of_no_size_of_the_body_is_refused_by_both_methods(body, method):
+    goal = goals.flat(body)
+    for far in (1e6, 1e16, 1e300):
+        astray = goal.copy()
+        astray[1, 0] = far
+        with pytest.raises(ValueError, match=r"has particle 1 at x = .*; 50 m from the origin"):
+            simplify(body, astray, method=method)
+    with pytest.raises(ValueError, match=r"millimetres\? scale=0\.001, or multiply by 0\.001"):
+        simplify(body, 1000 * goal, method=method)
+    with pytest.raises(ValueError, match=r"have 0 of their length at rest; 0\.1 is the least"):
+        simplify_batch(body, np.stack([goal, 0 * goal]), method=method)
+    assert simplify(body, goal + np.array([40.0, 0.0, 0.0]), method=method).max_error < 1e-5
+
+
+@pytest.mark.parametrize("method", ["robust", "paper"])
+@given(seed=st.integers(0, 10**6), share=st.floats(1e-3, 0.1), tolerance=st.floats(1e-4, 0.05))
+def test_the_status_of_a_rope_is_that_of_the_error_that_is_told(method, seed, share, tolerance):
+    noise = share * np.random.default_rng(seed).normal(size=BENT.shape)
+    (found,) = simplify_batch(ROPE, (BENT + noise)[None], method=method, tolerance=tolerance)
+    fits = found.rms_error < tolerance and found.error < tolerance
+    assert found.status == (FitStatus.FITS if fits else FitStatus.NO_FIT)
+    assert found.rms_error == pytest.approx(found.error, rel=1e-4)
+
+
+def test_a_goal_that_is_torn_everywhere_is_a_model_or_a_status():
+    torn = np.random.default_rng(0).uniform(-0.2, 0.2, (81, 3))
+    (found,) = simplify_batch(CLOTH, torn[None], method="paper", max_size=8)
+    assert found.status == FitStatus.NO_FIT
+    assert found.error > found.tolerance
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: simplify(ROPE, BENT, method=None), "method is None; choose from robust, paper"),
+        (lambda: simplify(ROPE, BENT, method=["paper"]), r"method is \['paper'\]; choose from"),
+        (lambda: simplify(ROPE, BENT, tolerance=np.nan), "tolerance is nan; give a number"),
+        (lambda: simplify(ROPE, BENT, tolerance=True), "tolerance is True; give a number"),
+        (lambda: simplify(CLOTH, CLOTH.rest, tolerance=1j), "tolerance is 1j; give a number"),
+        (lambda: simplify(ROPE, BENT, max_size=2.5), "max_size is 2.5; give a whole number of at"),
+        (lambda: simplify(CLOTH, CLOTH.rest, max_size=True), "max_size is True; give a whole"),
+        (lambda: simplify(ROPE, BENT, workspace=(0, 1)), r"workspace is \(0, 1\); give a jaxsimp"),
+        (lambda: simplify(ROPE, BENT[None]), r"the goal has shape \(1, 41, 3\); \(41, 3\) is"),
+        (lambda: simplify_batch(ROPE, BENT), r"goals has shape \(41, 3\); give a batch, .* call s"),
+        (lambda: simplify(ROPE, BENT.astype(object)), "the goal holds no real numbers; give a row"),
+        (lambda: Workspace(lower=(0.0, 0.0)), r"lower is \(0.0, 0.0\); give x, y and z in metres"),
+        (lambda: Workspace(upper=1j), "upper is 1j; give x, y and z in metres, -inf or inf for no"),
+        (lambda: Workspace(above_table="no"), "above_table is 'no'; give True or False"),
+        (lambda: Workspace(max_stretch=1e9), "max_stretch is 1000000000.0; give a number from"),
+    ],
+)  # fmt: skip
+def test_what_is_no_option_is_refused_where_it_is_given(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("method", ["robust", "paper"])
+def test_no_goals_have_no_key_points(method):
+    assert simplify_batch(ROPE, np.zeros((0, 41, 3)), method=method) == []

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsimp.bodies import Body
+from jaxsimp.checks import as_reals, require_number
 from jaxsimp.simplification import qp
 
 Bound = tuple[float, float, float]
@@ -30,7 +31,8 @@ class Workspace:
             allow some, such as 0.05: a taut goal with noise is longer than the rope.
 
     Raises:
-        ValueError: if a bound is NaN, `lower` is above `upper`, or `max_stretch` is below zero.
+        ValueError: if a bound is not three numbers, `lower` is above `upper`, `max_stretch` is no
+            number from 0 to 10, or another limit is not true or false.
     """
 
     lower: Bound = (-np.inf,) * 3
@@ -40,15 +42,23 @@ class Workspace:
     max_stretch: float | None = None
 
     def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            bound = as_reals(getattr(self, name))
+            if bound is None or bound.shape != (3,) or np.isnan(bound).any():
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}; give x, y and z in metres, -inf or inf for "
+                    f"no limit"
+                )
+        for name in ("above_table", "fixed_ends"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} is {getattr(self, name)!r}; give True or False")
         if not np.all(np.less_equal(self.lower, self.upper)):
             raise ValueError(
                 f"the workspace is from {self.lower} to {self.upper}; give an upper bound above "
                 f"the lower one on each axis"
             )
-        if self.max_stretch is not None and not 0 <= self.max_stretch < np.inf:
-            raise ValueError(
-                f"max_stretch is {self.max_stretch:g}; give a finite number, zero or more"
-            )
+        if self.max_stretch is not None:
+            require_number("max_stretch", self.max_stretch, 0.0, 10.0, "of the rest length")
 
 
 @dataclass(frozen=True, eq=False)

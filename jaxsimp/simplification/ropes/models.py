@@ -6,8 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsimp.bodies import Body
+from jaxsimp.bodies.size import LARGEST
+from jaxsimp.checks import require_count, require_number
 from jaxsimp.goals import as_goal
-from jaxsimp.simplification.key_points import SIZES_BEYOND, FitStatus, KeyPoints
+from jaxsimp.simplification.key_points import (
+    SIZES_BEYOND,
+    SMALLEST_TOLERANCE,
+    FitStatus,
+    KeyPoints,
+)
 from jaxsimp.simplification.ropes.fit import hat_weights
 
 NO_SIZE = -1
@@ -39,10 +46,8 @@ def check_ropes(
         raise ValueError(f"the {body.name} has {len(body.faces)} triangles; give a rope")
     tolerance = 0.015 * body.size if tolerance is None else tolerance
     max_size = default_max_size if max_size is None else max_size
-    if not 0 < tolerance < np.inf:
-        raise ValueError(f"tolerance is {tolerance:g}; give a distance above zero, in metres")
-    if max_size < 2:
-        raise ValueError(f"max_size is {max_size}; at least 2 is needed")
+    tolerance = require_number("tolerance", tolerance, SMALLEST_TOLERANCE, LARGEST, "m")
+    max_size = require_count("max_size", max_size, 2)
     checked = np.zeros((len(goals), *body.rest.shape))
     for index, goal in enumerate(goals):
         checked[index] = as_goal(body, goal)
@@ -110,6 +115,9 @@ def rope_models(
         distances = np.linalg.norm(fitted - goals[indices], axis=2)
         elements = np.stack([np.arange(size - 1), np.arange(1, size)], axis=1)
         for row, index in enumerate(indices.tolist()):
+            rms = float(np.sqrt(np.mean(distances[row] ** 2)))
+            # The error that is reported decides, too: that of the search may differ by rounding.
+            fits = columns[index] != NO_SIZE and rms < tolerance
             models[index] = KeyPoints(
                 particles=particles[row],
                 positions=positions[row],
@@ -120,9 +128,9 @@ def rope_models(
                 errors=tuple(errors[index, : tried[index]].tolist()),
                 tolerance=tolerance,
                 max_error=float(distances[row].max()),
-                rms_error=float(np.sqrt(np.mean(distances[row] ** 2))),
+                rms_error=rms,
                 certified=bool(certified[index]),
-                status=FitStatus.NO_FIT if columns[index] == NO_SIZE else FitStatus.FITS,
+                status=FitStatus.FITS if fits else FitStatus.NO_FIT,
             )
     return [models[index] for index in range(len(goals))]
 

@@ -86,7 +86,10 @@ def test_without_the_extra_the_remedy_is_named(monkeypatch):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [((-1.0, None), "tolerance is -1; give"), ((None, 3), "max_size is 3; at least 4")],
+    [
+        ((-1.0, None), r"tolerance is -1.0; give"),
+        ((None, 3), "max_size is 3; give a whole number of at least 4"),
+    ],
 )
 def test_bad_options_are_refused(options, message):
     sheet, goal = sheet_and_fold(5, (0, 1))

@@ -139,7 +139,7 @@ def test_a_small_part_counts_as_much_as_a_large_one():
 # --- invariants -----------------------------------------------------------------------------
 
 
-@given(seeds, st.floats(0.01, 100.0))
+@given(seeds, st.floats(0.02, 5.0))
 @settings(max_examples=8)
 def test_motions_and_scale_change_nothing(seed, scale):
     rng = np.random.default_rng(seed)
@@ -302,9 +302,9 @@ def test_two_sides_that_coincide_at_rest_are_kept_apart():
 
 def test_particles_of_no_triangle_are_left_out_of_account():
     sheet = cloth(9)
-    stray = mesh_body(np.concatenate([sheet.rest, [[9.0, 9.0, 9.0]]]), sheet.faces)
+    stray = mesh_body(np.concatenate([sheet.rest, [[3.0, 3.0, 3.0]]]), sheet.faces)
     goal = goals.fold(sheet, goals.flat(sheet), np.zeros(2), np.array([0.0, 1.0]))
-    points = robust(stray, np.concatenate([goal, [[-7.0, 0.0, 0.0]]]))
+    points = robust(stray, np.concatenate([goal, [[-3.0, 0.0, 0.0]]]))
     expected = robust(sheet, goal)
     assert np.array_equal(points.particles, expected.particles)
     assert points.max_error == pytest.approx(expected.max_error, abs=ROUNDING)
@@ -331,8 +331,8 @@ def test_no_model_of_so_few_points_is_no_key_point():
     assert points.error == np.inf
 
 
-def test_a_goal_in_one_point_has_the_fewest_key_points():
-    points = robust(cloth(5), np.zeros((25, 3)))
+def test_a_goal_in_a_small_place_has_the_fewest_key_points():
+    points = robust(cloth(5), goals.flat(cloth(5)) * 0.11)
     assert points.status == FitStatus.FITS
     assert len(points) <= 4
 
@@ -340,8 +340,8 @@ def test_a_goal_in_one_point_has_the_fewest_key_points():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"tolerance": 0.0}, "tolerance is 0; give a distance above zero"),
-        ({"max_size": 2}, "max_size is 2; at least 3"),
+        ({"tolerance": 0.0}, r"tolerance is 0.0; give a number from 1e-09 to 5 m"),
+        ({"max_size": 2}, "max_size is 2; give a whole number of at least 3"),
     ],
 )
 def test_bad_options_are_refused(options, message):
