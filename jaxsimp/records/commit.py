@@ -1,8 +1,8 @@
 """The commit of this package's own code: from its clone, or as stamped into it when it was built.
 
-The file COMMIT beside this one is a template in a clone. `git archive` fills it in, as .gitattributes
-says, and so does the build of a wheel or a source distribution (hatch_build.py, which runs this file
-by itself: it imports the standard library alone).
+The file COMMIT beside this one is a template in a clone. `git archive` fills it in, since
+.gitattributes says so, and the build of a wheel or a source distribution does: hatch_build.py runs
+this file by itself, so it imports the standard library alone.
 """
 
 import os
