@@ -81,7 +81,7 @@ class Kept(FunctionCache):
         """Keep what was compiled, if that is possible."""
         try:
             super().save_overload(sig, data)
-        except OSError as error:
+        except Exception as error:  # a full disk; what this numba cannot pickle
             then = "is not kept, and the next process compiles it again"
             _say("kept", self._what, f"jaxsimp: compiled code of {self._what} {then}: {error}")
 
