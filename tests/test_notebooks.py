@@ -34,7 +34,8 @@ def test_a_notebook_runs_and_shows_a_figure(path, monkeypatch):
     assert kinds[0] == "markdown"
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)
-    assert not [output for output in outputs if output.get("name") == "stderr"]
+    words = [output["text"] for output in outputs if output.get("name") == "stderr"]
+    assert all("jaxsimp: compiling " in text and text.count("\n") == 1 for text in words)
 
 
 def test_a_notebook_whose_check_fails_fails_the_test(monkeypatch):

@@ -1,6 +1,7 @@
 """The wheel and the source distribution: what is in them, their metadata, and that they run."""
 
 import os
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -10,6 +11,8 @@ from email.parser import Parser
 from pathlib import Path, PurePosixPath
 
 import pytest
+
+from jaxsimp.records.commit import STAMP, own_commit
 
 ROOT = Path(__file__).parents[1]
 
@@ -65,6 +68,32 @@ def test_the_source_distribution_has_what_a_developer_needs(built):
     assert {"README.md", "LICENSE", "CITATION.cff", "pyproject.toml"} <= names
     assert not [name for name in names if name.startswith((".ci", "results", ".venv", "dist/"))]
     assert not [name for name in names if name.endswith((".pyc", ".nbi", ".nbc"))]
+
+
+def test_what_is_built_carries_its_commit_into_any_repository(built, wheel, tmp_path):
+    template = (ROOT / STAMP).read_bytes()
+    (path,) = built.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        archive.extractall(tmp_path, filter="data")
+    unpacked = tmp_path / path.name.removesuffix(".tar.gz")
+    wheel.extractall(tmp_path / "site")
+    for folder in (tmp_path, tmp_path / "site", unpacked):
+        subprocess.run(["git", "init", "-q", str(folder)], check=True)
+    for folder in (tmp_path / "site", unpacked):
+        assert own_commit(folder) == own_commit(ROOT)
+    assert (ROOT / STAMP).read_bytes() == template  # nothing is left in the sources
+
+
+def test_what_is_built_outside_a_repository_says_so(tmp_path):
+    kept = ("pyproject.toml", "hatch_build.py", "README.md", "LICENSE", "jaxsimp/__init__.py")
+    for name in (*kept, str(STAMP), "jaxsimp/records/commit.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    (tmp_path / STAMP).write_text("$Format:%H$")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--wheel", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    (path,) = (tmp_path / "dist").glob("*.whl")
+    assert zipfile.ZipFile(path).read(STAMP.as_posix()) == b"unknown\n"
 
 
 def test_the_metadata_says_what_runs_it(metadata):

@@ -199,6 +199,13 @@ OBSTACLES = {
 }
 
 
+def corners_of(surface):
+    """Corners of what a surface was drawn with, shape (3, corners); Matplotlib keeps them inside."""
+    if hasattr(surface, "_faces"):
+        return np.reshape(surface._faces, (-1, 3)).T
+    return surface._vec[:3]  # before Matplotlib 3.11
+
+
 @pytest.mark.parametrize("obstacle", OBSTACLES.values(), ids=OBSTACLES.keys())
 def test_an_obstacle_is_drawn_where_its_surface_is(obstacle):
     axes = plt.figure().add_subplot(projection="3d")
@@ -206,7 +213,7 @@ def test_an_obstacle_is_drawn_where_its_surface_is(obstacle):
     viz.draw_obstacle(axes, obstacle)
     (surface,) = axes.collections
     axes.figure.canvas.draw()
-    corners = np.reshape(surface._faces, (-1, 3)).T
+    corners = corners_of(surface)
     # Seen from 10 m in float32: 1e-6 m of 10 m, a few times over.
     np.testing.assert_allclose(obstacle.distance(*corners)[0], 0.0, atol=1e-5)
     # It is all around: its extents are those of the obstacle, found by distances from outside.
@@ -225,7 +232,7 @@ def test_obstacles_are_cut_off_at_the_limits_of_the_picture():
     assert not axes.collections
     viz.draw_obstacle(axes, table_with_edge(0.1))
     axes.figure.canvas.draw()
-    corners = np.reshape(axes.collections[0]._faces, (-1, 3)).T
+    corners = corners_of(axes.collections[0])
     np.testing.assert_allclose(corners.min(axis=1), [-0.2, -0.1, -0.1])
     np.testing.assert_allclose(corners.max(axis=1), [0.1, 0.1, 0.0], atol=1e-5)
 

@@ -3,7 +3,6 @@
 import importlib.metadata
 import os
 import platform
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsimp.machine import num_cores
+from jaxsimp.records.commit import own_commit
 
 PACKAGES = (
     "jaxsimp",
@@ -40,7 +40,7 @@ def environment() -> dict[str, Any]:
     return {
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in PACKAGES},
-        "commit": _commit(),
+        "commit": own_commit(Path(__file__).parents[2]),
         "platform": platform.platform(),
         "processor": _processor(),
         "cores": num_cores(),
@@ -64,26 +64,12 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-def _commit() -> str:
-    """The commit of the code, with `+changes` if files differ from it."""
-    root = Path(__file__).parent
-    git = ["git", "-C", str(root)]
-    try:
-        commit = subprocess.run(
-            [*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-        status = subprocess.run(
-            [*git, "status", "--porcelain"], capture_output=True, text=True, check=True
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return commit + ("+changes" if status else "")
-
-
 def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:  # on systems other than Linux
+        lines = []
+    for line in lines:
+        if line.startswith("model name"):  # not on aarch64
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()

@@ -102,14 +102,17 @@ kept = []
 """XLA may ask for as long as the process lives."""
 
 
-def test_without_its_kernel_contact_is_as_defined_with_one_warning(monkeypatch):
+@pytest.mark.parametrize(
+    "refusal", [jax.errors.JaxRuntimeError, ImportError], ids=["of XLA", "of numba"]
+)
+def test_without_its_kernel_contact_is_as_defined_with_one_warning(monkeypatch, refusal):
     body = cloth((5, 5), (0.05, 0.05))
     simulation = make_simulation(body, 1e-3, self_contact=True)
     start = at_rest(goals.flat(body))
     wanted = settle(simulation, start, 5).position
 
     def refuse(name: str, dtype: str) -> None:
-        raise jax.errors.JaxRuntimeError(f"version 0.3 of {name} is incompatible")
+        raise refusal(f"version 0.3 of {name} is incompatible")
 
     def forget() -> None:
         compiled.has_kernel.cache_clear()

@@ -6,15 +6,18 @@ than a few hundred chains open. Segments and the costs of chains are defined the
 
 from typing import no_type_check  # numba cannot compile functions wrapped in type checks
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from jaxsimp.compiling import compiler
+
+compiled = compiler("the optimal fit of ropes")
 
 TIE = 1e-9
 """Fits whose squared errors are this close, relative to their size, are equal."""
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def settle(
     goals: Float[np.ndarray, "B N 3"],
@@ -77,7 +80,7 @@ def settle(
     return places, certified, costs
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def _branch(
     points: Float[np.ndarray, "N 3"],
@@ -131,7 +134,7 @@ def _branch(
     return least, True
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def _cost(
     points: Float[np.ndarray, "N 3"],
@@ -152,7 +155,7 @@ def _cost(
 # A chain's cost is a |x - c|² + e where it ends at x: its five numbers are a, e and c.
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def _start(points: Float[np.ndarray, "N 3"], chain: Float[np.ndarray, " 5"]) -> None:
     """Write the chain without a segment: half the weight of the first particle."""
@@ -160,7 +163,7 @@ def _start(points: Float[np.ndarray, "N 3"], chain: Float[np.ndarray, " 5"]) -> 
     chain[2:] = points[0]
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def _extend(
     line: Float[np.ndarray, " 7"],
@@ -180,7 +183,7 @@ def _extend(
     longer[1] = chain[1] + line[0] + share * (alpha * alpha - beta * beta) * squared
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def _close(chain: Float[np.ndarray, " 5"], last: Float[np.ndarray, " 3"]) -> float:
     """Squared error of a chain, with the second half of the last particle's weight."""
@@ -190,7 +193,7 @@ def _close(chain: Float[np.ndarray, " 5"], last: Float[np.ndarray, " 3"]) -> flo
     return chain[1] + 0.5 * chain[0] / (0.5 + chain[0]) * squared
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def _regression_lines(
     points: Float[np.ndarray, "N 3"], gains: Float[np.ndarray, "2 N 3"]
@@ -216,7 +219,7 @@ def _regression_lines(
     return lines
 
 
-@numba.njit(cache=True)
+@compiled
 @no_type_check
 def _suffix_bounds(
     points: Float[np.ndarray, "N 3"],

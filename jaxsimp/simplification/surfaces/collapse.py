@@ -10,8 +10,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
+from jaxsimp.compiling import compiler
 from jaxsimp.simplification.surfaces.model import LinkedMesh, Points, Triangles, Vector
 
 DIMENSIONS = 6  # goal x, y, z and rest x, y, z
@@ -20,9 +20,7 @@ THIN = 1e-6  # sine of an angle below which a triangle is degenerate
 SAME = 1e-14  # squared distances that differ by less are equal: above rounding at size 1
 LENGTH_WEIGHT = 1e-9  # weight of an edge's squared length in its price: decides at zero quadrics
 
-# Numba recompiles a cached function when its own file changes, not when a file that it calls
-# changes: after a change here delete the .nbi and .nbc files in `__pycache__`.
-compiled = njit(cache=True, nogil=True)
+compiled = compiler("the simplification of surfaces", nogil=True)
 Ids = Int[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "7 7"]
 Queue = list[tuple[float, int, int, int, int]]  # price, vertex that goes and one that stays, stamps

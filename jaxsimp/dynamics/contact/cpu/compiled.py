@@ -18,13 +18,14 @@ def has_kernel(name: str, dtype: str) -> bool:
     """Whether this XLA calls a kernel, by its name in kernels.py and the type of its numbers.
 
     A kernel is compiled, or loaded, when it is first asked for. If XLA does not support the
-    interface, a warning says so once: the definition in JAX gives the same, slower.
+    interface, or numba does not work here, a warning says so once: the definition in JAX gives the
+    same, slower.
     """
-    from jaxsimp.dynamics.contact.cpu import kernels  # numba takes a while to import
-
     try:
+        from jaxsimp.dynamics.contact.cpu import kernels  # numba takes a while to import
+
         kernels.register_kernel(name, dtype)
-    except jax.errors.JaxRuntimeError as error:
+    except Exception as error:  # whatever the reason: it is told, and there is another way
         _warn_once(str(error))
         return False
     return True
@@ -39,8 +40,8 @@ def _warn_once(reason: str) -> None:
         return
     _told.append(reason)
     warnings.warn(
-        f"self-contact runs without its compiled kernel, many times slower on a CPU: this jaxlib "
-        f"({jaxlib.version.__version__}) does not support its interface ({reason})",
+        f"self-contact runs without its compiled kernel, many times slower on a CPU: it does not "
+        f"work with this jaxlib ({jaxlib.version.__version__}) and numba ({reason})",
         stacklevel=2,
     )
 

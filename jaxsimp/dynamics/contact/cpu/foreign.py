@@ -11,8 +11,10 @@ from typing import Any, no_type_check  # numba needs functions as they are, not 
 
 import jax
 import numpy as np
-from numba import carray, cfunc, njit, types  # type: ignore[attr-defined] # gathered at import
+from numba import carray, njit, types  # type: ignore[attr-defined] # gathered at import
 from numba.extending import intrinsic
+
+from jaxsimp.compiling import callback, compiler
 
 MAJOR, MINOR = 0, 3
 """Version of the interface that the classes below mirror: what handlers answer to XLA, which
@@ -127,9 +129,8 @@ METADATA_TRAITS = _place(Metadata, "traits")
 OK = 0
 """Result of a handler: no error."""
 
-# What is compiled is kept on disk, and compiled anew when its own file changes, not when a file it
-# calls does: after a change here delete the .nbi and .nbc files in `__pycache__`.
-compiled = njit(cache=True)
+WHAT = "self-contact"
+compiled = compiler(WHAT)
 
 
 @intrinsic
@@ -258,7 +259,7 @@ def register(name: str, handler: Callable[[Any], int]) -> None:
     """
     if name in _registered:
         return
-    function = cfunc(types.int64(types.int64), cache=True)(handler)
+    function = callback(WHAT, types.int64(types.int64), handler)
     capsule = ctypes.PYFUNCTYPE(ctypes.py_object, *[ctypes.c_void_p] * 3)(
         ("PyCapsule_New", ctypes.pythonapi)
     )
