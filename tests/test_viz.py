@@ -200,7 +200,7 @@ OBSTACLES = {
 
 
 def corners_of(surface):
-    """Corners of what a surface was drawn with, shape (3, corners); Matplotlib keeps them inside."""
+    """Corners of what a surface was drawn with, shape (3, corners)."""
     if hasattr(surface, "_faces"):
         return np.reshape(surface._faces, (-1, 3)).T
     return surface._vec[:3]  # before Matplotlib 3.11
