@@ -92,7 +92,7 @@ def test_what_names_nothing_is_refused(values, count, message):
 
 @pytest.mark.parametrize("values", [[0.5], "ab", None, 1j, [[1], [1, 2]]])
 def test_what_is_no_array_of_whole_numbers_is_refused(values):
-    with pytest.raises(ValueError, match="ids is .*; give an array of whole numbers"):
+    with pytest.raises(ValueError, match=r"ids is .*; give an array of whole numbers"):
         require_whole("ids", values)
 
 
