@@ -106,6 +106,7 @@ class Door:
             result is wrong.
         weight: inputs in one round; low for slow doors.
         seconds: longest time of one input.
+        prepare: called once before, without a limit of time, as to compile what inputs share.
     """
 
     name: str
@@ -115,6 +116,7 @@ class Door:
     check: Callable[..., None] = no_check
     weight: int = 10
     seconds: float = SECONDS
+    prepare: Callable[[], object] | None = None
 
     def draw(self, seed: int, index: int) -> Input:
         """The input with an index: it depends on the seed, the door's name and the index alone."""
@@ -143,12 +145,21 @@ class Door:
 
         return drawn, take
 
+    @cached_property
+    def _prepared(self) -> bool:
+        """Whether `prepare` has been called: it is, at the first look."""
+        if self.prepare is not None:
+            with quiet():
+                self.prepare()
+        return True
+
     def judge(self, seed: int, index: int) -> Judged:
         """Draw an input, call the door, and judge what happens."""
         return self.judge_input(self.draw(seed, index), index)
 
     def judge_input(self, one: Input, index: int = -1) -> Judged:
         """Call the door with an input, and judge what happens."""
+        self._prepared  # noqa: B018
         text = str(one)
         valid = self.is_valid(**one.arguments)
         start = time.perf_counter()
@@ -171,7 +182,8 @@ class Door:
                 raise
             return Outcome.OTHER, _error_text(error)
         if valid is False:
-            return Outcome.SILENT, "accepted, and it is not valid"
+            blamed = ", ".join(sorted(one.hostile)) or "the values together"
+            return Outcome.SILENT, f"accepted, and it is not valid: {blamed}"
         try:
             with time_limit(3 * self.seconds), quiet():
                 self.check(result, **one.arguments)
@@ -204,7 +216,8 @@ def _is_of_signature(error: TypeError) -> bool:
     """Whether a `TypeError` is about the names of arguments, and not about a value."""
     text = str(error)
     ours = "is no parameter here; choose from" in text
-    return ours or "unexpected keyword argument" in text or "required positional" in text
+    signature = "unexpected keyword argument" in text or "required positional" in text
+    return ours or signature or "os.PathLike object, not" in text  # what Python says to a path
 
 
 def _is_raised_on_purpose(error: BaseException) -> bool:

@@ -37,11 +37,11 @@ def faults_of_refusal(text: str, values: Mapping[str, Any]) -> list[str]:
 
 
 def names_value(text: str, values: Mapping[str, Any]) -> bool:
-    """Whether a text names one of some values, or a number that follows from them."""
+    """Whether a text names one of some values, a file, or a number that follows from them."""
     if any(spelled and spelled in text for each in values.values() for spelled in spellings(each)):
         return True
     given, _, _ = text.partition(";")
-    return bool(re.search(r"\d|\bnan\b|\binf\b|\bempty\b|\bno\b", given))
+    return bool(re.search(r"\d|\bnan\b|\binf\b|\bempty\b|\bno\b|/\w+\.", given))
 
 
 def names_limit(text: str) -> bool:

@@ -72,6 +72,9 @@ def as_floats(value: Any) -> np.ndarray | None:
         array = np.asarray(value)
     except (ValueError, TypeError):
         return None
+    if array.dtype.kind == "O":  # numbers in an array of objects are still numbers
+        known = [is_number(each) for each in array.ravel()]
+        array = array.astype(float) if False not in known else array
     return array.astype(float) if array.dtype.kind in "iuf" else None
 
 

@@ -2,11 +2,12 @@
 
 import multiprocessing
 import signal
+import traceback
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from typing import Any
 
-from tests.fuzz.core import SECONDS, Judged, Outcome
+from tests.fuzz.core import SECONDS, Door, Judged, Outcome
 from tests.fuzz.settings import limit_memory, prepare
 
 PATIENCE = 6 * SECONDS
@@ -40,6 +41,8 @@ def judged_in_process(names: list[str], seed: int, start: int = 0) -> Iterator[J
                 if kind == "begins":
                     door, index, text = message
                     follow[door] = index + 1
+                elif kind == "fails":
+                    raise RuntimeError(f"the fuzzer itself fails at {door} {index}:\n{message}")
                 else:
                     yield message
             yield Judged(door, index, outcome, why, text, PATIENCE)
@@ -70,11 +73,18 @@ def _work(
     doors = all_doors()
     limit_memory()
     order = names[names.index(first) :] + names[: names.index(first)]
-    while True:
-        for name in order:
-            for _ in range(doors[name].weight):
-                index = follow[name]
-                follow[name] += 1
-                one = doors[name].draw(seed, index)
-                connection.send(("begins", (name, index, str(one))))
-                connection.send(("judged", doors[name].judge_input(one, index)))
+    try:
+        while True:
+            for name in order:
+                for _ in range(doors[name].weight):
+                    _judge_next(doors[name], follow, seed, connection)
+    except Exception:
+        connection.send(("fails", traceback.format_exc()))
+
+
+def _judge_next(door: Door, follow: dict[str, int], seed: int, connection: Connection) -> None:
+    index = follow[door.name]
+    follow[door.name] += 1
+    one = door.draw(seed, index)
+    connection.send(("begins", (door.name, index, str(one))))
+    connection.send(("judged", door.judge_input(one, index)))

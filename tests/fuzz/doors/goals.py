@@ -116,7 +116,8 @@ def _is_fold(body: Any, positions: Any, point: Any, direction: Any, part: Any = 
     whole = is_array(positions, body.rest.shape)
     mask = np.asarray(part)
     fine = part is None or (mask.dtype == bool and mask.shape == (body.num_particles,))
-    far = np.abs(as_floats(point)).max() > 10 or np.linalg.norm(as_floats(direction)) < 1e-100
+    length = np.linalg.norm(as_floats(direction))
+    far = np.abs(as_floats(point)).max() > 10 or not 1e-100 < length < 1e100
     known = whole is not False and is_size(extent(positions))
     return both(line, whole, fine, None if far or not known else True)
 
