@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import resource
 import signal
 import time
 import traceback
@@ -11,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -23,6 +25,8 @@ from tests.fuzz.telling import told
 
 SECONDS = 20.0
 """Longest time of one input."""
+SPARE_BYTES = 4 * 2**30
+"""Memory that an input may take, beyond what the process has mapped before."""
 BYTES = 8000
 """Random bytes from which an input is drawn."""
 
@@ -78,9 +82,12 @@ class Judged:
 
     @property
     def kind(self) -> str:
-        """What failures of one kind share: the detail without its numbers and names."""
-        text = re.sub(r"'[^']*'|\([^()]*\)|\[[^\[\]]*\]", "_", self.detail)
-        return re.sub(r"[-+]?\b(\d[\d.e+-]*|nan|inf)", "#", text)[:60]
+        """What failures of one kind share: an error's type and place, or words without values."""
+        raised, _, place = self.detail.rpartition(" (at ")
+        if place:
+            return f"{raised.partition(':')[0]} {place}"
+        text = re.sub(r"'[^']*'|\([^()]*\)|\[[^\[\]]*\]|\S*/\S*", "_", self.detail)
+        return re.sub(r"[-+]?\b(\d[\d.e+-]*|nan|inf)", "#", text)[:55]
 
 
 def accept(**_: Any) -> None:
@@ -161,7 +168,8 @@ class Door:
         """Call the door with an input, and judge what happens."""
         self._prepared  # noqa: B018
         text = str(one)
-        valid = self.is_valid(**one.arguments)
+        with quiet():
+            valid = self.is_valid(**one.arguments)
         start = time.perf_counter()
         outcome, detail = self._outcome(one, valid)
         seconds = time.perf_counter() - start
@@ -171,7 +179,7 @@ class Door:
 
     def _outcome(self, one: Input, valid: bool | None) -> tuple[Outcome, str]:
         try:
-            with time_limit(self.seconds), quiet():
+            with time_limit(self.seconds), memory_limit(), quiet():
                 result = self.function(**one.arguments)
         except TimeOut:
             return Outcome.HANG, f"over {self.seconds:g} s"
@@ -195,9 +203,7 @@ class Door:
             return Outcome.SILENT, f"accepted, and the check fails: {_error_text(error)}"
         return Outcome.RIGHT, ""
 
-    def _refusal(
-        self, one: Input, valid: bool | None, error: Exception
-    ) -> tuple[Outcome, str]:
+    def _refusal(self, one: Input, valid: bool | None, error: Exception) -> tuple[Outcome, str]:
         if isinstance(error, TypeError):
             if _is_of_signature(error):
                 return Outcome.REFUSED_WELL, _error_text(error)
@@ -264,6 +270,18 @@ def parameters_of(function: Callable[..., Any]) -> set[str]:
     kinds = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
     found = inspect.signature(function).parameters.values()
     return {each.name for each in found if each.kind not in kinds}
+
+
+@contextmanager
+def memory_limit() -> Iterator[None]:
+    """Let allocations that are far too large fail, instead of the machine."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + SPARE_BYTES, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 class TimeOut(BaseException):

@@ -6,18 +6,18 @@ from typing import Any
 
 from tests.fuzz.telling import spellings
 
-REMEDIES = (
-    "give choose use take make add write leave raise lower move remove join cut start spread pass "
-    "exchange name call install convert export set close turn ask decimate subdivide flatten "
-    "settle repair save load replace reduce increase rename run lay put keep check open delete "
-    "read wait free say change want stop let map pick wrap".split()
-)
+REMEDIES = """
+add ask call change check choose close convert cut decimate delete exchange export flatten free
+give increase install join keep lay leave let load lower make map move name open pass pick put
+raise read reduce remove rename repair replace run save say set settle spread start stop
+subdivide take turn use wait want wrap write
+"""
 """Verbs that tell a user what to do."""
-LIMITS = (
-    "finite whole number numbers array zero one two three four ids id shape least most up below "
-    "above between only positive each metres seconds names unique distinct order rope sheet mesh "
-    "triangles file folder json utf-8 text integer float task plan surface particle simple itself out".split()
-)
+LIMITS = """
+above array below between distinct each file finite float folder four id ids integer itself
+json least mesh metres most names number numbers one only order out particle plan positive rope
+seconds shape sheet simple surface task text three triangles two unique up utf-8 whole zero
+"""
 """Words of what is allowed, besides numbers and lists of names."""
 
 
@@ -48,11 +48,10 @@ def names_limit(text: str) -> bool:
     """Whether a text says what is allowed, after what was given: a number, words, or names."""
     _, _, allowed = text.partition(";")
     words = set(re.findall(r"[a-z0-9-]+", (allowed or text).lower()))
-    return bool(words & set(LIMITS)) or bool(re.search(r"\d|, ", allowed or text))
+    return bool(words & set(LIMITS.split())) or bool(re.search(r"\d|, ", allowed or text))
 
 
 def names_remedy(text: str) -> bool:
     """Whether a text says what to do."""
     words = set(re.findall(r"[a-z]+", text.lower()))
-    return bool(words & set(REMEDIES))
-
+    return bool(words & set(REMEDIES.split()))

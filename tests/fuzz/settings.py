@@ -1,13 +1,9 @@
-"""What a process of the fuzzer sets first: JAX that compiles quickly, and a limit of memory."""
+"""What a process of the fuzzer sets first: JAX that compiles quickly."""
 
 import atexit
 import os
-import resource
 import shutil
 import tempfile
-
-SPARE_BYTES = 8 * 2**30
-"""Memory that inputs may take, beyond what the process has mapped at the start."""
 
 
 def prepare() -> None:
@@ -21,11 +17,3 @@ def prepare() -> None:
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     os.environ.setdefault("MPLBACKEND", "Agg")
-
-
-def limit_memory() -> None:
-    """Let allocations that are far too large fail, instead of the machine."""
-    with open("/proc/self/statm") as file:
-        mapped = int(file.read().split()[0]) * resource.getpagesize()
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (mapped + SPARE_BYTES, hard))

@@ -18,12 +18,20 @@ def both(*verdicts: bool | None) -> bool | None:
     return None if any(each is None for each in verdicts) else True
 
 
+def float_of(value: Any) -> float:
+    """A number as a float; infinity for an integer that is too large for one."""
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf")
+
+
 def is_number(value: Any) -> bool | None:
     """Whether a value is a real number; None for one in an unusual form."""
     if isinstance(value, bool | np.bool_):
         return False
     if isinstance(value, int | float | np.integer | np.floating):
-        return bool(abs(value) < 1e308)  # no NaN, which compares with nothing
+        return -1e308 < float_of(value) < 1e308  # no NaN, which compares with nothing
     name = type(value).__name__
     if name in ("Fraction", "Decimal") or (is_jax(value) and np.ndim(value) == 0):
         return None
@@ -32,14 +40,12 @@ def is_number(value: Any) -> bool | None:
     return False
 
 
-def in_range(
-    value: Any, low: float, high: float, *, absurd: tuple[float, float]
-) -> bool | None:
+def in_range(value: Any, low: float, high: float, *, absurd: tuple[float, float]) -> bool | None:
     """Whether a number is valid: sure from `low` to `high`, surely not outside `absurd`."""
     verdict = is_number(value)
     if verdict is False:
         return False
-    number = float(value)
+    number = float_of(value)
     if not absurd[0] <= number <= absurd[1]:
         return False
     return both(verdict, True if low <= number <= high else None)

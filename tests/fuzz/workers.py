@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from tests.fuzz.core import SECONDS, Door, Judged, Outcome
-from tests.fuzz.settings import limit_memory, prepare
+from tests.fuzz.settings import prepare
 
 PATIENCE = 6 * SECONDS
 """Time without a sign of life after which a process is killed."""
@@ -22,7 +22,7 @@ def judged_in_process(names: list[str], seed: int, start: int = 0) -> Iterator[J
         seed: seed of the inputs.
         start: index of the first input of each door.
     """
-    follow = {name: start for name in names}
+    follow = dict.fromkeys(names, start)
     first = names[0]
     while True:
         process, connection = _started(names, follow, first, seed)
@@ -71,7 +71,6 @@ def _work(
     from tests.fuzz.doors import all_doors
 
     doors = all_doors()
-    limit_memory()
     order = names[names.index(first) :] + names[: names.index(first)]
     try:
         while True:

@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 import jaxsimp as js
 from tests.fuzz.core import Door, Parameter
 from tests.fuzz.valid import as_floats, both, in_range, is_array, is_count, is_one_of
-from tests.fuzz.values import anything, array, count, number, value_of
+from tests.fuzz.values import anything, array, count, number
 
 BODY = js.rope(5)
 NAMES = ("stiffness", "damping", "drag", "friction")
 REST = BODY.rest + np.array([0.0, 0.0, BODY.radius])
 PICK = np.array([[0, -1], [2, 4]])
 MOVE = 0.02 * np.ones((2, 2, 3))
-SEEN = np.stack([REST + [0.0, 0.0, 0.01], REST + [0.0, 0.0, 0.02]])
+SEEN = REST + np.array([[[0.0, 0.0, 0.01]], [[0.0, 0.0, 0.02]]])
 ONE_STEP = js.CalibrationConfig(steps=1)
 
 

@@ -13,13 +13,29 @@ from hypothesis import strategies as st
 from jaxsimp import records
 from jaxsimp.cli.main import main as jaxsimp_main
 from tests.fuzz.core import Door, Parameter
-from tests.fuzz.doors.goals import BODY_FILES, ODD, WHOLE, SURELY_WRONG
+from tests.fuzz.doors.goals import BODY_FILES, ODD, SURELY_WRONG, WHOLE
 from tests.fuzz.files import FOLDER, FileCase, files
 from tests.fuzz.valid import both
 
 REFUSED = 2
-ODD_NUMBERS = ("nan", "inf", "-inf", "-1", "0", "x", "", "1e300", "1e-300", "1j", "0x10", "2.5",
-               "99999999999999999999", "1,5", "--", "٣")
+ODD_NUMBERS = (
+    "nan",
+    "inf",
+    "-inf",
+    "-1",
+    "0",
+    "x",
+    "",
+    "1e300",
+    "1e-300",
+    "1j",
+    "0x10",
+    "2.5",
+    "99999999999999999999",
+    "1,5",
+    "--",
+    "٣",
+)
 
 
 class Opened(BaseException):
@@ -113,8 +129,10 @@ def _is_simplify(
         False if goal.damage == "odd" and goal.source in SURELY_WRONG and body is None else None,
         False if goal.content is None or goal.damage in ("a folder", "empty", "noise") else None,
     ]
-    is_plain = not goal.damage and not _ and all(
-        each is None for each in (body, tolerance, lower, max_stretch)
+    is_plain = (
+        not goal.damage
+        and not _
+        and all(each is None for each in (body, tolerance, lower, max_stretch))
     )
     return False if False in verdicts else (True if is_plain and method == "robust" else None)
 
@@ -163,8 +181,14 @@ def _study(study: str = "paper", **options: Any) -> tuple[int, str]:
     return _result(*_captured(_run_study, arguments))
 
 
-WHOLE_NUMBERS = ("seeds", "resolution", "num_iterations", "population", "num_actions",
-                 "initial_populations")
+WHOLE_NUMBERS = (
+    "seeds",
+    "resolution",
+    "num_iterations",
+    "population",
+    "num_actions",
+    "initial_populations",
+)
 CHOICES = {
     "method": ("robust", "paper", "meshlab"),
     "budget": ("default", "paper", "goals"),
@@ -181,13 +205,13 @@ def _is_study(**given: Any) -> bool | None:
         if name in CHOICES:
             verdicts.append(value in CHOICES[name])
         elif name in WHOLE_NUMBERS:
-            is_whole = str(value).isascii() and str(value).isdigit()
+            is_whole = str(value).isdigit()  # in any script, as Python reads them
             verdicts.append(is_whole and 1 <= int(value) < 2**31)
             verdicts.append(not (name == "resolution" and is_whole and int(value) < 5))
         elif name in RANGES:
             low, high = RANGES[name]
             number = _is_positive(value, zero=name == "smoothing")
-            verdicts.append(False if number is False or not low <= float(value) <= high else True)
+            verdicts.append(number is not False and low <= float(value) <= high)
             verdicts.append(not (name == "smoothing" and number is None and float(value) >= 1))
         elif name == "tasks":
             verdicts.append(bool(value) and set(value) == {"rope_folding"})
@@ -210,10 +234,12 @@ DOORS = (
         {
             "goal": files(WHOLE, ODD),
             "body": Parameter(
-                st.just(None), files(BODY_FILES, ODD).hostile.map(
-                    lambda case: FileCase(f"body-{case.name}", case.content, case.damage,
-                                          case.source)
-                )
+                st.just(None),
+                files(BODY_FILES, ODD).hostile.map(
+                    lambda case: FileCase(
+                        f"body-{case.name}", case.content, case.damage, case.source
+                    )
+                ),
             ),
             "method": Parameter(
                 st.sampled_from(("robust", "paper")), st.sampled_from(("unknown", "", "ROBUST"))

@@ -17,7 +17,6 @@ from tests.fuzz.values import (
     count,
     flag,
     number,
-    value_of,
 )
 
 BODY = js.rope(5)
@@ -117,9 +116,11 @@ def is_obstacle(obstacle: Any) -> bool | None:
 def are_obstacles(obstacles: Any) -> bool | None:
     """Whether a value is a sequence of obstacles."""
     if not isinstance(obstacles, list | tuple):
-        return None if isinstance(obstacles, np.ndarray | dict | set | str) and not len(
-            obstacles
-        ) else False
+        return (
+            None
+            if isinstance(obstacles, np.ndarray | dict | set | str) and not len(obstacles)
+            else False
+        )
     return both(*map(is_obstacle, obstacles)) if obstacles else True
 
 
@@ -148,9 +149,7 @@ def _is_simulation(
 
 
 def _check_simulation(simulation: js.Simulation, body: js.Body, **_: Any) -> None:
-    for name, leaf in zip(
-        ("leaf",) * 99, jax.tree.leaves(simulation), strict=False
-    ):
+    for name, leaf in zip(("leaf",) * 99, jax.tree.leaves(simulation), strict=False):
         assert np.isfinite(np.asarray(leaf)).all(), f"a {name} of the simulation is not finite"
     assert np.allclose(simulation.mass, body.mass, rtol=1e-6), "other masses"
 
@@ -217,11 +216,13 @@ def _is_table(**given: Any) -> bool | None:
         "edge": ((-1.0, 1.0), (-1e6, 1e6)),
         "rounding": ((0.0, 0.05), (0.0, 1e6)),
         "half_width": ((0.5, 2.0), (1e-9, 1e6)),
-        "height": ((0.2, 1.0), (1e-9, 1e6)),
+        "height": ((0.25, 1.0), (1e-9, 1e6)),
     }
     return both(
-        *(in_range(value, *ranges[name][0], absurd=ranges[name][1])
-          for name, value in given.items())
+        *(
+            in_range(value, *ranges[name][0], absurd=ranges[name][1])
+            for name, value in given.items()
+        )
     )
 
 
@@ -266,7 +267,7 @@ DOORS = (
             "edge": number(-1.0, 1.0),
             "rounding": number(0.0, 0.05),
             "half_width": number(0.5, 2.0),
-            "height": number(0.2, 1.0),
+            "height": number(0.25, 1.0),
         },
         _is_table,
     ),

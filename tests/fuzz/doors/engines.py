@@ -15,13 +15,10 @@ from tests.fuzz.valid import both, in_range, is_array, is_count, is_flag, is_one
 from tests.fuzz.values import (
     anything,
     array,
-    between,
     choice,
     count,
     flag,
-    made,
     number,
-    value_of,
 )
 
 TASK = js.make_task("rope_folding", 5)
@@ -135,8 +132,13 @@ def _layout(population: Any, chunk_size: Any) -> Any:
     return default_layout(population, chunk_size)
 
 
-def _replay(pick: Any = PICK, displacement: Any = MOVE, start: Any = EPISODE.start,
-            variant: Any = "fast", num_workers: Any = 1) -> Any:
+def _replay(
+    pick: Any = PICK,
+    displacement: Any = MOVE,
+    start: Any = EPISODE.start,
+    variant: Any = "fast",
+    num_workers: Any = 1,
+) -> Any:
     episode, plan = js.Episode(start, EPISODE.goal), js.Actions(pick, displacement)
     return list(js.replay(TASK, [episode], [plan], variant, num_workers=num_workers))
 

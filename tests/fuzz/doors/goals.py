@@ -17,11 +17,10 @@ from tests.fuzz.valid import (
     extent,
     in_range,
     is_array,
-    is_number,
     is_one_of,
     is_size,
 )
-from tests.fuzz.values import anything, array, between, choice, number, value_of
+from tests.fuzz.values import anything, array, choice, number, value_of
 
 ROPE, CLOTH = js.rope(9), js.cloth((5, 5))
 SHIRT = js.t_shirt(num_particles=160)
@@ -45,7 +44,8 @@ def goals_of(body: js.Body) -> st.SearchStrategy[np.ndarray]:
             return goal.copy()
         rng = np.random.default_rng(seed)
         noise = rng.normal(scale=1e-3, size=goal.shape) * [1.0, 1.0, 0.0]
-        return goals.turn(goal + noise, rng.uniform(-3, 3)) + [*rng.uniform(-0.5, 0.5, 2), 0.0]
+        place = np.array([*rng.uniform(-0.5, 0.5, 2), 0.0])
+        return goals.turn(goal + noise, rng.uniform(-3, 3)) + place
 
     return st.builds(placed, st.sampled_from(GOALS[id(body)]), st.integers(0, 1000))
 
@@ -165,8 +165,11 @@ ODD = (
     (".npz", "unordered cloud", npz(positions=np.random.default_rng(0).permutation(FOLDED))),
     (".npz", "shuffled rope", npz(positions=SHUFFLED)),
     (".npz", "millimetres", npz(positions=1e3 * GOALS[id(ROPE)][1])),
-    (".npz", "millimetres of a sheet", npz(positions=1e3 * FOLDED, rest=1e3 * SHEET,
-                                           faces=CLOTH.faces)),
+    (
+        ".npz",
+        "millimetres of a sheet",
+        npz(positions=1e3 * FOLDED, rest=1e3 * SHEET, faces=CLOTH.faces),
+    ),
     (".npz", "one place", npz(positions=np.zeros((9, 3)))),
     (".npz", "no positions", npz(points=FOLDED)),
     (".npz", "objects", npz(positions=np.array([None, "a"], dtype=object))),
@@ -190,7 +193,7 @@ ODD = (
     (".npz", "no array", b"PK\x05\x06" + bytes(18)),
     (".npy", "an array alone", npy(GOALS[id(ROPE)][1])),
     (".npy", "an array of a cloud", npy(np.random.default_rng(0).permutation(FOLDED))),
-    (".usd", "USD", b"#usda 1.0\ndef Mesh \"m\" {}\n"),
+    (".usd", "USD", b'#usda 1.0\ndef Mesh "m" {}\n'),
     (".obj", "mesh", MESHES[".obj"]),
     (".txt", "text", b"0 0 0\n1 0 0\n"),
 )
@@ -327,7 +330,7 @@ DOORS = (
         {"corners": array(st.just(np.array([[0.0, 0.0], [0.2, 0.1], [0.3, -0.1]])))},
         lambda corners: both(
             is_array(corners, (None, 2)),
-            False if is_array(corners, (None, 2)) is False or len(corners) < 2 else True,
+            is_array(corners, (None, 2)) is not False and len(corners) > 1,
             None,
         ),
         _check_positions,
@@ -336,9 +339,9 @@ DOORS = (
         "goals.straight",
         lambda length=None: goals.straight(ROPE, length),
         {"length": number(0.1, 0.5)},
-        lambda length=None: True
-        if length is None
-        else in_range(length, 0.1, 0.5, absurd=(1e-9, 5.001)),
+        lambda length=None: (
+            True if length is None else in_range(length, 0.1, 0.5, absurd=(1e-9, 5.001))
+        ),
         _check_positions,
     ),
     Door(

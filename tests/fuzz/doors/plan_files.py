@@ -156,12 +156,16 @@ def _is_save(
     whole = None if np.asarray(pick).dtype.kind in "iu" else False
     scored = is_number(score)
     nan = isinstance(score, float | np.floating) and not np.isfinite(score)  # kept as null
-    plain = found is None or found == {"a": 1}
+    plain = found is None or (isinstance(found, dict) and repr(found) == "{'a': 1}")
     return both(
         whole,
         is_array(displacement, MOVE.shape),
-        is_array(positions, FRAMES.shape) or (None if np.shape(positions) == FRAMES.shape
-                                              and as_floats(positions) is not None else False),
+        is_array(positions, FRAMES.shape)
+        or (
+            None
+            if np.shape(positions) == FRAMES.shape and as_floats(positions) is not None
+            else False
+        ),
         None if nan else scored,
         True if plain else (None if isinstance(found, dict) else False),
     )

@@ -10,7 +10,7 @@ import jaxsimp as js
 from tests.fuzz.core import Door, Parameter
 from tests.fuzz.doors.dynamics import is_plan
 from tests.fuzz.valid import as_floats, both, in_range, is_array, is_count, is_flag, is_one_of
-from tests.fuzz.values import anything, array, choice, count, flag, made, number, value_of
+from tests.fuzz.values import anything, array, choice, count, flag, made, number
 
 TASK = js.make_task("rope_folding", 5)
 EPISODE = TASK.episode_fn(0)
@@ -97,9 +97,7 @@ def is_candidates(candidates: Any, num_particles: int) -> bool | None:
 
 
 def _check_problem(problem: Any, candidates: Any, **_: Any) -> None:
-    ids = np.asarray(
-        candidates.particles if isinstance(candidates, js.KeyPoints) else candidates
-    )
+    ids = np.asarray(candidates.particles if isinstance(candidates, js.KeyPoints) else candidates)
     wanted = np.flatnonzero(ids) if ids.dtype == bool else ids
     assert np.array_equal(problem.space.candidates, wanted), "other candidates"
 
@@ -356,7 +354,7 @@ DOORS = (
         },
         _is_execute,
         _check_execute,
-        weight=10,
+        weight=8,
         prepare=_execute,
     ),
     Door(

@@ -122,8 +122,7 @@ def _open_with(content: bytes | None, others: tuple[str, ...] = ()) -> Path:
 
 def _is_config(content: bytes | None, others: tuple[str, ...] = ()) -> bool | None:
     if content is None:
-        known = set(others) <= {"config.json.part", "lock"}
-        return True if known else False
+        return set(others) <= {"config.json.part", "lock"}
     try:
         same = json.loads(content.decode()) == CONFIG
     except (ValueError, RecursionError):

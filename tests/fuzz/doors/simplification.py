@@ -10,8 +10,18 @@ from jaxsimp import goals
 from tests.fuzz.core import Door, Parameter
 from tests.fuzz.doors.goals import CLOTH, GOALS, ROPE, is_goal
 from tests.fuzz.valid import as_floats, both, in_range, is_array, is_count, is_flag, is_one_of
-from tests.fuzz.values import anything, array, between, choice, count, flag, made, number
-from tests.fuzz.values import NO_NUMBERS, ODD_NUMBERS
+from tests.fuzz.values import (
+    NO_NUMBERS,
+    ODD_NUMBERS,
+    anything,
+    array,
+    between,
+    choice,
+    count,
+    flag,
+    made,
+    number,
+)
 
 METHODS = ("robust", "paper", "meshlab")
 
@@ -163,7 +173,11 @@ def _is_workspace(
     bounds = [as_floats(each) for each in (lower, upper)]
     if any(each is None or each.shape != (3,) or np.isnan(each).any() for each in bounds):
         return False
-    if (bounds[0] > bounds[1]).any() or np.isposinf(bounds[0]).any() or np.isneginf(bounds[1]).any():
+    if (
+        (bounds[0] > bounds[1]).any()
+        or np.isposinf(bounds[0]).any()
+        or np.isneginf(bounds[1]).any()
+    ):
         return False
     tuples = isinstance(lower, tuple) and isinstance(upper, tuple)
     stretch = True if max_stretch is None else in_range(max_stretch, 0, 1, absurd=(0, 1e300))

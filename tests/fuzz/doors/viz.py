@@ -9,12 +9,13 @@ import jaxsimp as js
 from jaxsimp import viz
 from tests.fuzz.core import Door, Parameter
 from tests.fuzz.doors.goals import CLOTH, GOALS, ROPE
-from tests.fuzz.valid import as_floats, both, is_array
-from tests.fuzz.values import anything, array
+from tests.fuzz.valid import both, is_array
+from tests.fuzz.values import array
 
 POINTS = js.simplify(ROPE, GOALS[id(ROPE)][1])
 RUNS = np.array([[3.0, 2.0, 1.0], [3.5, 2.5, 0.5]])
 SCORES = np.array([[0.9, 0.8], [0.5, np.nan]])
+FOLDED = GOALS[id(CLOTH)][1]
 FRAMES = np.stack([GOALS[id(CLOTH)][0]] * 3)
 
 
@@ -45,7 +46,7 @@ def _model(goal: Any, name: Any = "goal") -> Any:
     return _drawn(viz.plot_simplifications, {name: (ROPE, goal, POINTS)})
 
 
-def _executions(frames: Any, score: Any = 0.5, goal: Any = GOALS[id(CLOTH)][1]) -> Any:
+def _executions(frames: Any, score: Any = 0.5, goal: Any = FOLDED) -> Any:
     return _drawn(viz.plot_executions, CLOTH, goal, {"method": (frames, score)}, "title")
 
 
