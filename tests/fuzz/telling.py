@@ -41,21 +41,21 @@ def is_jax(value: Any) -> bool:
 
 
 def spellings(value: Any) -> set[str]:
-    """Texts by which a message may name a value."""
-    if value is None or isinstance(value, bool | str | bytes | complex):
-        return {str(value)[:40], repr(value)[:40]}
+    """Texts by which a message may name a value: itself, its type, its shape."""
     if hasattr(value, "spellings"):
         return set(value.spellings)
-    if isinstance(value, int | float | np.number):
-        return _of_number(value)
+    shape = getattr(value, "shape", ())
+    found = {str(value)[:40], repr(value)[:40], type(value).__name__, f"shape {shape}"}
     if isinstance(value, np.ndarray) or is_jax(value):
-        return _of_array(np.asarray(value))
+        return found | _of_array(np.asarray(value))
+    if isinstance(value, int | float | np.number):
+        return found | _of_number(value) | {"single number"}
     if isinstance(value, tuple | list):
-        parts = set().union(*(spellings(each) for each in value[:20])) if value else {"empty"}
-        return parts | {repr(value)[:40], str(value)[:40], f"shape ({len(value)},"}
+        parts = [spellings(each) for each in value[:20]]
+        return found.union(*parts) | {f"shape ({len(value)},", "empty"}
     if isinstance(value, dict):
-        return set().union(*(spellings(each) for each in value.values()), map(str, value))
-    return {repr(value)[:30], str(value)[:30], type(value).__name__}
+        return found.union(*map(spellings, value.values()), map(str, value))
+    return found
 
 
 def _of_number(value: Any) -> set[str]:
@@ -69,7 +69,7 @@ def _of_number(value: Any) -> set[str]:
 
 
 def _of_array(array: np.ndarray) -> set[str]:
-    found = {str(array.dtype), str(array.shape), f"shape {array.shape}"}
+    found = {str(array.dtype), str(array.shape), str(array.tolist())[:40]}
     if array.size == 0:
         found |= {"empty", "no ", "0"}
     if array.dtype.kind in "iufb" and array.size:

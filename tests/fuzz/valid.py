@@ -51,15 +51,25 @@ def in_range(value: Any, low: float, high: float, *, absurd: tuple[float, float]
     return both(verdict, True if low <= number <= high else None)
 
 
-def is_count(value: Any, low: int, high: int, *, most: int = 2**31 - 1) -> bool | None:
-    """Whether a value is a whole number, sure from `low` to `high`, surely not outside `most`."""
-    if isinstance(value, bool | np.bool_):
+def is_count(
+    value: Any, low: int, high: int, *, least: int | None = None, most: int = 2**31 - 1
+) -> bool | None:
+    """Whether a value is a whole number: sure from `low` to `high`, surely not outside the rest.
+
+    Args:
+        value: what was given.
+        low: smallest number that is valid for sure.
+        high: largest number that is valid for sure.
+        least: smallest number that may be valid; `low` by default.
+        most: largest number that may be valid.
+    """
+    least = low if least is None else least
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole and not (is_number(value) is None and float(value).is_integer()):
         return False
-    if isinstance(value, int | np.integer):
-        return True if low <= value <= high else (None if high < value <= most else False)
-    if is_number(value) is None and float(value).is_integer():
-        return None if low <= float(value) <= most else False
-    return False
+    if not least <= value <= most:
+        return False
+    return True if whole and low <= value <= high else None
 
 
 def is_one_of(value: Any, names: Collection[Any]) -> bool:
@@ -106,7 +116,7 @@ def extent(points: Any) -> float:
 
 
 def is_size(size: float) -> bool | None:
-    """Whether a body or goal of an extent is allowed; None within rounding of a limit."""
-    if not np.isfinite(size) or not SMALLEST * (1 - 1e-5) <= size <= LARGEST * (1 + 1e-5):
+    """Whether a body or goal of an extent is allowed; None at a limit."""
+    if not np.isfinite(size) or not 0.99 * SMALLEST <= size <= 1.01 * LARGEST:
         return False
-    return True if SMALLEST * (1 + 1e-5) <= size <= LARGEST * (1 - 1e-5) else None
+    return True if 1.001 * SMALLEST <= size <= 0.999 * LARGEST else None

@@ -341,10 +341,9 @@ def _is_garment(ranges: dict[str, tuple[float, float]]) -> Any:
         ]
         others = {name: each for name, each in given.items() if name in PHYSICS}
         one_or_two = is_count(sheets, 1, 2, most=2)
-        particles = is_count(num_particles, 150, 400, most=10**7)
         # How many particles an outline needs is not documented.
-        small = None if particles is False and is_count(num_particles, 3, 150) else particles
-        return both(*sizes, small, one_or_two, is_physics(**others))
+        particles = is_count(num_particles, 150, 400, least=3, most=10**7)
+        return both(*sizes, particles, one_or_two, is_physics(**others))
 
     return is_valid
 
@@ -389,7 +388,9 @@ def _is_outline(corners: Any, num_points: Any) -> bool | None:
         return False
     known = is_size(extent(corners)) if extent(corners) > 5.001 else None
     is_own = any(np.array_equal(corners, each) for each in (SQUARE, HALF))
-    return both(shape, is_count(num_points, 60, 400, most=10**7), known, True if is_own else None)
+    return both(
+        shape, is_count(num_points, 60, 400, least=3, most=10**7), known, True if is_own else None
+    )
 
 
 def _check_outline(result: Any, num_points: Any, **_: Any) -> None:
@@ -400,7 +401,9 @@ def _check_outline(result: Any, num_points: Any, **_: Any) -> None:
 
 
 def _is_remesh(points: Any, faces: Any, num_points: Any) -> bool | None:
-    return both(is_sheet(points, faces, 1.0), is_count(num_points, 60, 400, most=10**7), None)
+    return both(
+        is_sheet(points, faces, 1.0), is_count(num_points, 60, 400, least=3, most=10**7), None
+    )
 
 
 materials = st.sampled_from([None, *MATERIALS.values()])

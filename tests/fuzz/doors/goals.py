@@ -136,8 +136,8 @@ def _fold_lists() -> st.SearchStrategy[Any]:
 
 
 def _is_sequence(body: Any, folds: Any, positions: Any = None) -> bool | None:
-    if not isinstance(folds, list | tuple):
-        return None if hasattr(folds, "__iter__") and not isinstance(folds, str | bytes) else False
+    if not isinstance(folds, list | tuple) or not len(folds):
+        return None if hasattr(folds, "__iter__") and not isinstance(folds, bytes) else False
     if not all(isinstance(each, goals.Fold) for each in folds):
         return False
     at = goals.flat(body) if positions is None else positions
@@ -282,9 +282,9 @@ def _check_read(result: Any, path: FileCase) -> None:
     points, faces = result
     assert points.dtype == np.float64, f"points of {points.dtype}"
     assert faces.size, "no triangles"
-    assert faces.min() >= 0, "an id is below zero"
-    assert faces.max() < len(points), "an id is too large"
-    if not path.damage:
+    if not path.damage:  # ids are documented to be unchecked
+        assert faces.min() >= 0, "an id is below zero"
+        assert faces.max() < len(points), "an id is too large"
         is_soup = path.source == "mesh .stl"  # which repeats its points
         assert is_soup or len(points) == 25, f"{len(points)} points for 25"
         assert is_soup or np.allclose(points, grid(5)[0], atol=1e-6), "another order of points"

@@ -44,9 +44,7 @@ def _is_call(
     workspace: Any = None,
 ) -> bool | None:
     limit = None if tolerance is None else in_range(tolerance, 1e-3, 0.05, absurd=(1e-300, 1e6))
-    most = None if max_size is None else is_count(max_size, 2 if body is ROPE else 4, 2**31 - 1)
-    least = max_size is not None and is_count(max_size, 1, 2**31 - 1)
-    most = None if most is False and least else most
+    most = None if max_size is None else is_count(max_size, 4, 100, least=1)
     room = workspace is None or isinstance(workspace, js.Workspace)
     own = not (isinstance(workspace, js.Workspace) and body is CLOTH)
     reached = is_goal(body, goal, strict=False)
@@ -138,7 +136,7 @@ def _is_batch(body: js.Body, goals: Any, **options: Any) -> bool | None:
     except TypeError:
         return False
     if not each:
-        return _is_call(body, GOALS[id(body)][0], **options)
+        return None  # no goal, no result: the options do not matter
     shape = is_array(goals, (None, *body.rest.shape)) if isinstance(goals, np.ndarray) else None
     return both(shape, *(_is_call(body, goal, **options) for goal in each))
 
