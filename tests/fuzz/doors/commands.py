@@ -149,8 +149,9 @@ def _without_runs() -> Iterator[None]:
     real = records.open_folder
 
     def opened(*arguments: Any, **options: Any) -> Any:
-        real(*arguments, **options)
-        raise Opened
+        found = real(*arguments, **options)
+        with found if hasattr(found, "__enter__") else contextlib.nullcontext():
+            raise Opened
 
     with patch.object(records, "open_folder", opened):
         yield

@@ -1,5 +1,6 @@
 """Records: folders of results, rows, and JSON, with files that were damaged."""
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -110,13 +111,20 @@ def _bad_lines(content: bytes) -> bool | None:
     return False if is_bad else None
 
 
+def held(folder: Path, config: Any) -> contextlib.AbstractContextManager[Any]:
+    """A folder of results that is open: as a context, or else for good."""
+    opened = records.open_folder(folder, config)
+    return opened if hasattr(opened, "__enter__") else contextlib.nullcontext()
+
+
 def _open_with(content: bytes | None, others: tuple[str, ...] = ()) -> Path:
     folder = _fresh()
     if content is not None:
         (folder / records.CONFIG_FILE).write_bytes(content)
     for name in others:
         (folder / name).write_text("{")
-    records.open_folder(folder, CONFIG)
+    with held(folder, CONFIG):
+        assert json.loads((folder / records.CONFIG_FILE).read_text()) == CONFIG
     return folder
 
 
@@ -137,7 +145,8 @@ def _check_config(folder: Path, **_: Any) -> None:
 
 def _open_new(config: Any) -> Any:
     folder = _fresh() / "new"
-    records.open_folder(folder, config)
+    with held(folder, config):
+        pass
     return json.loads((folder / records.CONFIG_FILE).read_text())
 
 
