@@ -14,7 +14,7 @@ subdivide take turn use wait want wrap write
 """
 """Verbs that tell a user what to do."""
 LIMITS = """
-above array below between distinct each file finite float folder four id ids integer itself
+above another array below between distinct each file finite float folder four id ids integer itself
 json least mesh metres most names number numbers one only order out particle plan positive rope
 seconds shape sheet simple surface task text three triangles two unique up utf-8 whole zero
 """
@@ -41,7 +41,7 @@ def names_value(text: str, values: Mapping[str, Any]) -> bool:
     if any(spelled and spelled in text for each in values.values() for spelled in spellings(each)):
         return True
     given, _, _ = text.partition(";")
-    return bool(re.search(r"\d|\bnan\b|\binf\b|\bempty\b|\bno\b|/\w+\.", given))
+    return bool(re.search(r"\d|\bnan\b|\binf\b|\bempty\b|\bno\b|/\w|'.*'", given))
 
 
 def names_limit(text: str) -> bool:

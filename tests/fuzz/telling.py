@@ -1,5 +1,6 @@
 """Values as short texts, for lines that reproduce an input and for messages that name it."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,8 @@ def spellings(value: Any) -> set[str]:
     if isinstance(value, tuple | list):
         parts = [spellings(each) for each in value[:20]]
         return found.union(*parts) | {f"shape ({len(value)},", "empty"}
+    if isinstance(value, str):
+        return found | {str(Path(value[:200]))}  # "" is the folder "."
     if isinstance(value, dict):
         return found.union(*map(spellings, value.values()), map(str, value))
     return found

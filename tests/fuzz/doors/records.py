@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from jaxsimp import records
 from tests.fuzz.core import Door, Parameter
 from tests.fuzz.files import FOLDER, MUTATIONS
-from tests.fuzz.values import anything, made
 
 CONFIG = {"name": "fuzz", "seeds": 3, "tasks": ["a", "b"]}
 ROWS = [{"task": "a", "seed": seed, "score": 0.5 * seed} for seed in range(3)]
@@ -143,49 +142,6 @@ def _check_config(folder: Path, **_: Any) -> None:
     assert found == CONFIG, "another configuration is written"
 
 
-def _open_new(config: Any) -> Any:
-    folder = _fresh() / "new"
-    with held(folder, config):
-        pass
-    return json.loads((folder / records.CONFIG_FILE).read_text())
-
-
-ODD_CONFIGS = (
-    lambda: {"a": float("nan")},
-    lambda: {"a": 1j},
-    lambda: {"a": {1}},
-    lambda: {1: 2},
-    lambda: {"a": b"x"},
-    lambda: {"\ud800": 1},
-    lambda: {"a": object()},
-)
-
-
-def _is_json(config: Any) -> bool | None:
-    if not isinstance(config, dict):
-        return False
-    try:
-        json.dumps(config, allow_nan=False)
-    except (TypeError, ValueError):
-        return None if config != config or "nan" in repr(config) else False
-    return True if config == CONFIG else None
-
-
-def _append(row: Any) -> list[Any]:
-    path = _fresh() / "rows.jsonl"
-    records.append_row(path, ROWS[0])
-    try:
-        records.append_row(path, row)
-    finally:
-        rows = records.read_rows(path)
-        assert rows[0] == ROWS[0], "an earlier row is lost"
-    return rows
-
-
-def _check_appended(rows: Any, row: Any) -> None:
-    assert len(rows) == 2, f"{len(rows)} rows after two were added"
-
-
 DOORS = (
     Door(
         "records.read_rows",
@@ -209,20 +165,5 @@ DOORS = (
         _is_config,
         _check_config,
         weight=25,
-    ),
-    Door(
-        "records.open_folder.config",
-        _open_new,
-        {"config": Parameter(st.just(CONFIG), made(ODD_CONFIGS) | anything, False)},
-        _is_json,
-        weight=5,
-    ),
-    Door(
-        "records.append_row",
-        _append,
-        {"row": Parameter(st.sampled_from(ROWS), made(ODD_CONFIGS) | anything, False)},
-        lambda row: any(row is each for each in ROWS) or _is_json(row),
-        _check_appended,
-        weight=5,
     ),
 )
