@@ -37,8 +37,9 @@ def _told_array(array: np.ndarray) -> str:
 
 
 def is_jax(value: Any) -> bool:
-    """Whether a value is an array of JAX."""
-    return type(value).__module__.startswith("jax")
+    """Whether a value is an array of numbers of JAX, and no key of its random numbers."""
+    is_array = type(value).__module__.startswith("jax") and hasattr(value, "dtype")
+    return is_array and "key" not in str(value.dtype)
 
 
 def spellings(value: Any) -> set[str]:

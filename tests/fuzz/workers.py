@@ -42,7 +42,9 @@ def judged_in_process(names: list[str], seed: int, start: int = 0) -> Iterator[J
                     door, index, text = message
                     follow[door] = index + 1
                 elif kind == "fails":
-                    raise RuntimeError(f"the fuzzer itself fails at {door} {index}:\n{message}")
+                    raise RuntimeError(
+                        f"the fuzzer itself fails at or after {door} {index}:\n{message}"
+                    )
                 else:
                     yield message
             yield Judged(door, index, outcome, why, text, PATIENCE)

@@ -206,7 +206,7 @@ def _is_optimize(key: Any = None, batch: Any = None) -> bool | None:
     keyed = key is None or (
         isinstance(key, jax.Array) and jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key)
     )
-    old = isinstance(key, jax.Array) and key.dtype == np.uint32 and key.shape == (2,)
+    old = isinstance(key, jax.Array) and str(key.dtype) == "uint32" and key.shape == (2,)
     shaped = key is None or np.shape(key) == () or old
     small = True if batch is None else is_count(batch, 1, 100)
     return both((keyed and shaped) or (None if old else False), small)
