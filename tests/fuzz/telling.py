@@ -54,7 +54,10 @@ def spellings(value: Any) -> set[str]:
         return found | _of_number(value) | {"single number"}
     if isinstance(value, tuple | list):
         parts = [spellings(each) for each in value[:20]]
-        return found.union(*parts) | {f"shape ({len(value)},", "empty"}
+        return found.union(*parts) | {
+            f"shape ({len(value)},",
+            *(() if value else ("empty", "()", "[]")),
+        }
     if isinstance(value, str):
         return found | {str(Path(value[:200]))}  # "" is the folder "."
     if isinstance(value, dict):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 import jaxsimp as js
 from tests.fuzz.core import Door, Parameter
 from tests.fuzz.doors.goals import CLOTH
+from tests.fuzz.telling import is_jax
 from tests.fuzz.valid import as_floats, both, in_range, is_array, is_count, is_flag
 from tests.fuzz.values import (
     anything,
@@ -144,7 +145,7 @@ def _is_simulation(
         pull,
         are_obstacles(obstacles),
         is_flag(self_contact),
-        True if is_default and not self_contact else speed,
+        True if is_default and self_contact is False else speed,
     )
 
 
@@ -176,7 +177,7 @@ def is_plan(pick: Any, displacement: Any, num_particles: int, shape: Any = None)
         return False
     if not np.isin(ids, range(-1, num_particles)).all() or (shape and ids.shape != shape):
         return False
-    plain = all(isinstance(each, np.ndarray | jax.Array) for each in (pick, displacement))
+    plain = all(is_jax(each) or type(each) is np.ndarray for each in (pick, displacement))
     return True if plain and np.abs(moves).max(initial=0) < 10 and ids.size else None
 
 

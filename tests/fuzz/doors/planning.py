@@ -237,6 +237,18 @@ def _check_search(found: Any, value: Any = 1.0) -> None:
 
 
 algorithms = (SMALL, js.RandomShooting(), js.Descent(), js.Reranking())
+COSTS = (
+    lambda: np.nan,
+    lambda: np.inf,
+    lambda: -np.inf,
+    lambda: 1e300,
+    lambda: np.array([np.nan, 1.0]),
+    lambda: np.ones(3),
+    lambda: np.ones((2, 1)),
+    lambda: np.array([1, 2]),
+    lambda: np.array([1j, 2.0]),
+    lambda: np.array(["a", "b"]),
+)
 KEYS = (
     lambda: jax.random.split(jax.random.key(0), 2),
     lambda: jax.random.PRNGKey(0),
@@ -371,7 +383,7 @@ DOORS = (
     Door(
         "planning.search_on_host",
         _search,
-        {"value": Parameter(st.just(1.0), anything)},
+        {"value": Parameter(st.just(1.0), made(COSTS))},
         _is_costs_told,
         _check_search,
         weight=4,
