@@ -168,14 +168,21 @@ class Door:
         """Call the door with an input, and judge what happens."""
         self._prepared  # noqa: B018
         text = str(one)
-        with quiet():
-            valid = self.is_valid(**one.arguments)
+        valid = self._verdict(one)
         start = time.perf_counter()
         outcome, detail = self._outcome(one, valid)
         seconds = time.perf_counter() - start
         if seconds > self.seconds and outcome != Outcome.HANG:
             outcome, detail = Outcome.HANG, f"{seconds:.0f} s, then: {outcome}: {detail}"
         return Judged(self.name, index, outcome, detail, text, seconds)
+
+    def _verdict(self, one: Input) -> bool | None:
+        """What the predicate says; no to arguments that it cannot even read."""
+        try:
+            with quiet():
+                return self.is_valid(**one.arguments)
+        except (TypeError, ValueError, AttributeError, IndexError, OverflowError):
+            return False
 
     def _outcome(self, one: Input, valid: bool | None) -> tuple[Outcome, str]:
         try:
