@@ -55,6 +55,12 @@ def _calibrate(action_seconds: Any = 0.05, kinds: Any = None, **given: Any) -> A
     return js.calibrate(BODY, [recording], action_seconds, ONE_STEP, kinds=kinds, **given)
 
 
+def _compile() -> None:
+    """Compile for each number of kinds that inputs have: 2 by default, 1 of their own."""
+    _calibrate()
+    _calibrate(kinds=np.zeros(len(BODY.springs), int))
+
+
 def _is_recording(
     pick: Any = PICK,
     displacement: Any = MOVE,
@@ -163,6 +169,6 @@ DOORS = (
         _is_recording,
         _check_fit,
         weight=2,
-        prepare=_calibrate,
+        prepare=_compile,
     ),
 )
