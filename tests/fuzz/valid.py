@@ -67,9 +67,9 @@ def is_count(
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole and not (is_number(value) is None and float(value).is_integer()):
         return False
-    if not least <= value <= most:
+    if not least <= float_of(value) <= most:
         return False
-    return True if whole and low <= value <= high else None
+    return True if whole and low <= int(value) <= high else None
 
 
 def is_one_of(value: Any, names: Collection[Any]) -> bool:
