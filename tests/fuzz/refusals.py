@@ -21,8 +21,12 @@ seconds shape sheet simple surface task text three triangles two unique up utf-8
 """Words of what is allowed, besides numbers and lists of names."""
 
 
+FOREIGN = re.compile(r"allow_pickle|pickle\.load|charset_normalizer|ModuleNotFound|NotImplemented")
+"""What other libraries say that misleads a user: to load a file unsafely, to install a part."""
+
+
 def faults_of_refusal(text: str, values: Mapping[str, Any]) -> list[str]:
-    """What a refusal lacks, of "value", "limit" and "remedy".
+    """What a refusal lacks, of "value", "limit", "remedy" and "words of its own".
 
     Args:
         text: text of the error.
@@ -32,6 +36,7 @@ def faults_of_refusal(text: str, values: Mapping[str, Any]) -> list[str]:
         "value": not names_value(text, values),
         "limit": not names_limit(text),
         "remedy": not names_remedy(text),
+        "words of its own": bool(FOREIGN.search(text)),
     }
     return [name for name, is_fault in faults.items() if is_fault]
 
