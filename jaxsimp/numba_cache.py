@@ -74,7 +74,11 @@ class Kept(FunctionCache):
                 self.flush()
             found = None
         if found is None:
-            _say_compiling(self._what, f"once: it is kept in {self._cache_path}")
+            _say(
+                *("compiles", self._what),
+                f"jaxsimp: compiling {self._what}, which takes up to a minute, once: it is kept in "
+                f"{self._cache_path}",
+            )
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -82,8 +86,11 @@ class Kept(FunctionCache):
         try:
             super().save_overload(sig, data)
         except Exception as error:  # a full disk; what this numba cannot pickle
-            then = "is not kept, and the next process compiles it again"
-            _say("kept", self._what, f"jaxsimp: compiled code of {self._what} {then}: {error}")
+            _say(
+                *("keeps", self._what),
+                f"jaxsimp: compiled code of {self._what} is not kept, and the next process "
+                f"compiles it again: {error}",
+            )
 
 
 class NotKept(NullCache):
@@ -94,18 +101,17 @@ class NotKept(NullCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> None:
         """Nothing: say once that it is compiled, and how to have it kept."""
-        remedy = "set NUMBA_CACHE_DIR to a folder that can be written"
-        _say_compiling(self._what, f"in every process, since {self._reason}: {remedy}")
+        _say(
+            *("compiles", self._what),
+            f"jaxsimp: compiling {self._what}, which takes up to a minute, in every process, since "
+            f"{self._reason}: set NUMBA_CACHE_DIR to a folder that can be written",
+        )
 
 
 @cache
 def _stamp(folder: Path) -> str:
     """Hash of all Python files of a folder."""
     return sha256(b"\0".join(each.read_bytes() for each in sorted(folder.glob("*.py")))).hexdigest()
-
-
-def _say_compiling(what: str, how_often: str) -> None:
-    _say("compiles", what, f"jaxsimp: compiling {what}, which takes up to a minute, {how_often}")
 
 
 def _say(occasion: str, what: str, text: str) -> None:
