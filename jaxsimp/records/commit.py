@@ -11,6 +11,8 @@ import tomllib
 from pathlib import Path
 
 UNKNOWN = "unknown"
+CODE = ("jaxsimp", "experiments")
+"""What results depend on: a folder of results elsewhere in the clone is no change."""
 STAMP = Path("jaxsimp", "records", "COMMIT")
 """The file with the stamp, from the root of a clone, or from the folder of an installation."""
 
@@ -57,7 +59,7 @@ def _head(root: Path) -> str:
         return done.stdout.strip()
 
     try:
-        head, changes = answer("rev-parse", "--verify", "HEAD"), answer("status", "--porcelain")
+        head, changes = answer("rev-parse", "--verify", "HEAD"), answer("status", "-s", "--", *CODE)
     except (OSError, subprocess.SubprocessError):
         return UNKNOWN
     return head.decode() + ("+changes" if changes else "")

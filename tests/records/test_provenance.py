@@ -73,6 +73,15 @@ def test_the_commit_of_a_clone_is_named_and_changes_are_marked(clone):
     assert own_commit(clone) == head + "+changes"
 
 
+def test_a_folder_of_results_in_a_clone_is_no_change(clone):
+    head = commit_all(clone)
+    (clone / "my_results").mkdir()
+    (clone / "my_results" / "runs.jsonl").write_text("{}")
+    assert own_commit(clone) == head
+    (clone / "jaxsimp" / "new.py").write_text("a = 1")
+    assert own_commit(clone) == head + "+changes"
+
+
 def test_the_commit_of_a_worktree_is_its_own(clone, tmp_path):
     commit_all(clone)
     git(clone, "worktree", "add", "-q", str(tmp_path / "worktree"))
