@@ -7,6 +7,7 @@ import math
 import sys
 import time
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -101,6 +102,8 @@ class Options:
         for name, path in (("--json", self.json), ("--figure", self.figure)):
             if path is None:
                 continue
+            with suppress(FileNotFoundError):
+                path.stat()  # raises for a name that no file can have; is_dir since 3.14 does not
             if path.is_dir():
                 raise ValueError(f"{path} is a folder; give a file with {name}")
             if not path.parent.is_dir():
