@@ -1,7 +1,7 @@
 """Rollouts: semi-implicit Euler steps of a simulation under actions, as `jax.lax.scan`.
 
 Pure functions of arrays: `jit`, `vmap`, `grad` and `scan` apply. Reverse mode uses the adjoint of
-adjoint.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`.
+adjoint.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`, see modes.py.
 """
 
 from collections.abc import Callable
@@ -35,8 +35,9 @@ def rollout(
         state: state at the start, shapes (N, 3).
         actions: the plan, shapes (T, G) and (T, G, 3).
         observe: function applied to the state at the end of each action.
-        adjoint: whether to differentiate by the adjoint of adjoint.py, in reverse mode only; False
-            leaves differentiation to JAX, in either mode, but reverse takes many times as long.
+        adjoint: whether to differentiate by the adjoint of adjoint.py: in reverse mode, and without
+            self-contact twice by `jax.hessian`. False leaves differentiation to JAX, in any mode
+            and order, but reverse takes many times as long.
 
     Returns:
         The state at the end of the last action, and the observations stacked along a first
@@ -67,12 +68,7 @@ def rollout_observing(
         moving = run(simulation, moving, motion, speed_profile(pickers.steps))
         return moving, observe(end(simulation, moving), action)
 
-    try:
-        moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
-    except TypeError as error:
-        if "custom_vjp" in str(error):
-            error.add_note("the adjoint is for reverse mode: pass adjoint=False to rollout")
-        raise
+    moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
     return end(simulation, moving), observations
 
 
