@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from jaxsimp.checks import require_count
 from jaxsimp.dynamics.adjoint import plain_steps, steps
 from jaxsimp.dynamics.contact.stepping import Moving, begin, end
-from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, speed_profile
+from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, require_actions, speed_profile
 from jaxsimp.dynamics.simulation import Simulation, State
 from jaxsimp.dynamics.step import Motion, unpack
 
@@ -42,6 +43,9 @@ def rollout(
     Returns:
         The state at the end of the last action, and the observations stacked along a first
         axis of length T; by default the positions, shape (T, N, 3).
+
+    Raises:
+        ValueError: if `require_actions` refuses the plan, or the state is of another body.
     """
     return rollout_observing(
         simulation, pickers, state, actions, lambda state, _: observe(state), adjoint=adjoint
@@ -58,6 +62,8 @@ def rollout_observing(
     adjoint: bool = True,
 ) -> tuple[State, PyTree[Any]]:
     """`rollout`, but `observe` takes the state at the end of each action, and the action."""
+    _require_state(simulation, state)
+    actions = require_actions(actions, len(simulation.mass))
     run = steps if adjoint else plain_steps
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
@@ -73,10 +79,28 @@ def rollout_observing(
 
 
 def settle(simulation: Simulation, state: State, num_steps: int) -> State:
-    """The state after `num_steps` time steps with nothing held."""
+    """The state after `num_steps` time steps with nothing held.
+
+    Raises:
+        ValueError: if `num_steps` is no whole number, or the state is of another body.
+    """
+    _require_state(simulation, state)
+    num_steps = require_count("num_steps", num_steps, 0)
     moving = begin(simulation, state)
     held = jnp.zeros(len(state.position), dtype=bool)
     drive = jnp.zeros_like(state.position.T)
     share = jnp.zeros(num_steps, dtype=drive.dtype)
     moving = steps(simulation, moving, Motion(held, drive), share)
     return end(simulation, moving)
+
+
+def _require_state(simulation: Simulation, state: State) -> None:
+    """Raise a `ValueError` unless a state is of the simulated body."""
+    wanted = (len(simulation.mass), 3)
+    for name in ("position", "velocity"):
+        found = jnp.shape(getattr(state, name))
+        if found != wanted:
+            raise ValueError(
+                f"the state has {name} of shape {found}; this body of {wanted[0]} particles needs "
+                f"shape {wanted}"
+            )
