@@ -79,12 +79,14 @@ if TYPE_CHECKING:
         Ensemble,
         Execution,
         ExecutionStatus,
+        GoalScores,
         Layout,
         MassSprings,
         MuJoCo,
         SearchEngine,
         Spread,
         compare_with_mjx,
+        goal_scores,
         make_ensemble,
         replay,
     )
@@ -148,6 +150,7 @@ __all__ = [
     "FitStatus",
     "Garment",
     "GaussianIndex",
+    "GoalScores",
     "Joint",
     "KeyPoints",
     "Layout",
@@ -184,6 +187,7 @@ __all__ = [
     "dynamics",
     "engines",
     "from_mesh",
+    "goal_scores",
     "goals",
     "largest_time_step",
     "least_radius",
@@ -231,8 +235,8 @@ _ROOMS = {
     "dynamics": "NONE Actions Box Capsule Obstacle Pickers Plane Simulation Sphere State Table "
     "at_rest largest_time_step least_radius make_pickers make_simulation rollout settle "
     "table_with_edge",
-    "engines": "Engine Ensemble Execution ExecutionStatus Layout MassSprings MJX MuJoCo "
-    "SearchEngine Spread compare_with_mjx make_ensemble replay",
+    "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
+    "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",
     "goals": "",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical Descent Encoding GaussianIndex "

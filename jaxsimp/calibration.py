@@ -18,13 +18,16 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.material import PARAMETERS
-from jaxsimp.dynamics.pickers import Actions, Pickers, make_pickers
+from jaxsimp.checks import require_count, require_number
+from jaxsimp.dynamics.pickers import Actions, Pickers, make_pickers, require_actions
 from jaxsimp.dynamics.rollouts import rollout
 from jaxsimp.dynamics.simulation import Simulation, State, largest_time_step, make_simulation
 from jaxsimp.dynamics.springs import make_springs
 
 LONGEST_TIME_STEP = 2e-3
 """Longest time step of replays, seconds."""
+SECONDS = {"action_seconds": (1e-4, 1e4), "longest_time_step": (1e-6, 1.0)}
+"""Least and most of times, seconds, as of a task."""
 MOST_KINDS = 4
 """Number of different stiffnesses above which all springs share one factor."""
 
@@ -81,17 +84,11 @@ class CalibrationConfig:
             raise ValueError(
                 f"parameters is {self.parameters}; choose from {', '.join(PARAMETERS)}"
             )
-        if self.steps < 1:
-            raise ValueError(f"steps is {self.steps}; at least 1 is needed")
-        if not 0 < self.learning_rate < np.inf:
-            raise ValueError(f"learning_rate is {self.learning_rate}; give a number above 0")
-        if not 1 < self.largest_factor < np.inf:
-            raise ValueError(f"largest_factor is {self.largest_factor}; give a number above 1")
-        if not 0 < self.smallest_factor < 1:
-            raise ValueError(
-                f"smallest_factor is {self.smallest_factor}; give a number between 0 and 1"
-            )
-        _check_seconds("longest_time_step", self.longest_time_step)
+        require_count("steps", self.steps, 1, 1_000_000)
+        require_number("learning_rate", self.learning_rate, 1e-6, 10.0)
+        require_number("largest_factor", self.largest_factor, 1.001, 1e6)
+        require_number("smallest_factor", self.smallest_factor, 1e-9, 0.999)
+        _require_seconds("longest_time_step", self.longest_time_step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +141,7 @@ def calibrate(
             number for each spring.
     """
     config = config or CalibrationConfig()
-    _check_seconds("action_seconds", action_seconds)
+    _require_seconds("action_seconds", action_seconds)
     _check_fitted(body, config)
     stacked, kinds = _stack(body, recordings), _check_kinds(body, kinds)
     least_stable = _scaled_body(body, _extremes(config), kinds)
@@ -176,8 +173,8 @@ def simulate_recordings(
     Raises:
         ValueError: as `calibrate` does for recordings.
     """
-    _check_seconds("action_seconds", action_seconds)
-    _check_seconds("longest_time_step", longest_time_step)
+    _require_seconds("action_seconds", action_seconds)
+    _require_seconds("longest_time_step", longest_time_step)
     stacked = _stack(body, recordings)
     time_step, steps = _time_step(body, action_seconds, longest_time_step)
     return np.asarray(_replays(steps, make_simulation(body, time_step, gravity), stacked))
@@ -352,23 +349,28 @@ def _check_recording(index: int, recording: Recording, count: int, shape: tuple[
             raise ValueError(
                 f"recording {index} has a value that is not finite; leave such moments out"
             )
+    try:
+        require_actions(recording.actions, count)
+    except ValueError as error:
+        raise ValueError(f"recording {index}: {error}") from error
 
 
 def _check_kinds(body: Body, kinds: Int[np.ndarray, " S"] | None) -> Int[np.ndarray, " S"]:
     if kinds is None:
         values, kinds = np.unique(body.stiffness, return_inverse=True)
         return kinds if len(values) <= MOST_KINDS else np.zeros_like(kinds)
-    if kinds.shape != body.stiffness.shape or kinds.min(initial=0) < 0:
+    kinds, count = np.asarray(kinds), len(body.stiffness)
+    whole = np.issubdtype(kinds.dtype, np.integer)
+    if kinds.shape != (count,) or not whole or not np.all((kinds >= 0) & (kinds < count)):
         raise ValueError(
-            f"kinds has shape {kinds.shape} and least value {kinds.min(initial=0)}; give one "
-            f"number from 0 for each of {len(body.stiffness)} springs"
+            f"kinds is an array of {kinds.dtype} of shape {kinds.shape}, its least value "
+            f"{kinds.min(initial=0)}; give one whole number from 0 for each of {count} springs"
         )
     return kinds
 
 
-def _check_seconds(name: str, seconds: float) -> None:
-    if not 0 < seconds < np.inf:
-        raise ValueError(f"{name} is {seconds}; give a finite number above zero")
+def _require_seconds(name: str, seconds: float) -> None:
+    require_number(name, seconds, *SECONDS[name], "s")
 
 
 def _check_fitted(body: Body, config: CalibrationConfig) -> None:

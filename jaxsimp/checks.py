@@ -29,6 +29,15 @@ def require_count(name: str, value: object, least: int, most: int = MOST) -> int
     return whole
 
 
+def require_seed(value: object) -> int:
+    """A seed: a whole number of 32 bits, of which JAX and NumPy both use every bit.
+
+    Raises:
+        ValueError: if it is anything else.
+    """
+    return require_count("seed", value, 0, 2**32 - 1)
+
+
 def require_number(
     name: str, value: object, lowest: float, highest: float, unit: str = ""
 ) -> float:

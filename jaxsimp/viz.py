@@ -58,6 +58,7 @@ def plot_simplifications(models: Mapping[str, tuple[Body, Positions, KeyPoints]]
     """
     import matplotlib.pyplot as plt
 
+    _require_some(models)
     figure = plt.figure(figsize=(9.2, 3.3 * len(models)), layout="constrained")
     for row, (name, (body, goal, model)) in enumerate(models.items()):
         shown = figure.add_subplot(len(models), 2, 2 * row + 1, projection="3d")
@@ -154,6 +155,7 @@ def plot_executions(
     """
     import matplotlib.pyplot as plt
 
+    _require_some(executions)
     columns = max(len(positions) for positions, _ in executions.values()) + 1
     figure, grid = plt.subplots(
         len(executions),
@@ -317,6 +319,7 @@ def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Fig
     """A figure with one panel per item, two per row."""
     import matplotlib.pyplot as plt
 
+    _require_some(items)
     columns = min(2, len(items))
     rows = -(-len(items) // columns)
     figure, grid = plt.subplots(
@@ -331,6 +334,12 @@ def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Fig
     for unused in panels[len(items) :]:
         unused.remove()
     return figure, panels[: len(items)]
+
+
+def _require_some(items: Mapping[str, object]) -> None:
+    """Raise a `ValueError` if there is nothing to draw."""
+    if not items:
+        raise ValueError("there is nothing to draw; give at least one entry, by its name")
 
 
 def _title(name: str) -> str:

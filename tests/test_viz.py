@@ -299,3 +299,19 @@ def test_importing_viz_does_not_import_matplotlib():
     code = "import sys, jaxsimp.viz; sys.exit('matplotlib' in sys.modules)"
     root = Path(__file__).parents[1]
     assert subprocess.run([sys.executable, "-c", code], cwd=root).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        viz.plot_model_errors,
+        viz.plot_models,
+        viz.plot_simplifications,
+        viz.plot_costs,
+        lambda none: viz.plot_scores(none, "ours", "theirs", 0.9),
+        lambda none: viz.plot_executions(rope(5), np.zeros((5, 3)), none, "nothing"),
+    ],
+)
+def test_nothing_to_draw_is_refused(draw):
+    with pytest.raises(ValueError, match="nothing to draw; give at least one entry"):
+        draw({})

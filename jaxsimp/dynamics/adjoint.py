@@ -26,6 +26,7 @@ from jaxsimp.dynamics.contact.stepping import (
     touch_step,
     touch_step_vjp,
 )
+from jaxsimp.dynamics.modes import constant, forward_only, reverse_only
 from jaxsimp.dynamics.simulation import Simulation
 from jaxsimp.dynamics.step import Axes, Motion, Packed, step_and_free, step_vjp
 
@@ -62,7 +63,8 @@ def steps(
     Shares count as constants. A CPU runs contact by its compiled kernels.
     """
     leaves, tree = jax.tree.flatten(simulation)
-    return _moving(_steps(tree, leaves, _flat(moving), motion.held, motion.drive, shares))
+    leaves, flat, drive = reverse_only((leaves, _flat(moving), motion.drive))
+    return _moving(_steps(tree, leaves, flat, motion.held, drive, shares))
 
 
 Flat = tuple[Packed, list[Any]]
@@ -113,6 +115,8 @@ def _forward(tree: PyTreeDef, *arguments: Any) -> tuple[Flat, Kept]:
         arguments,
         is_leaf=lambda leaf: hasattr(leaf, "perturbed"),
     )
+    again = constant if flat[1] else forward_only  # compiled kernels have no derivative
+    leaves, flat, drive = again((leaves, flat, drive))
 
     def run(shared: Shared, own: tuple[Any, ...]) -> tuple[Flat, Starts]:
         (leaves, shares), (flat, *motion) = shared, own

@@ -22,6 +22,9 @@ def batch_last(
 
     @wrapped.def_vmap
     def over_batch(size: int, batched: Any, shared: Any, own: Any) -> tuple[Any, Any]:
+        if not any(jax.tree.leaves(batched)):  # a batch of tangents alone, as in a Hessian
+            result = fn(shared, own)
+            return result, jax.tree.map(lambda _: False, result)
         if any(jax.tree.leaves(batched[0])):
             axes = jax.tree.map(lambda each: 0 if each else None, batched)
             result = jax.vmap(fn, axes)(shared, own)

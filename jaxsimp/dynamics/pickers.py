@@ -3,17 +3,28 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsimp.checks import require_count, require_number, require_numbers
 from jaxsimp.dynamics.contact.obstacles import Obstacle, Table
 
 NONE = -1
 """The particle id of a picker that grasps nothing (None in Eq. 1 of the paper)."""
 GRAZE = 1e-5
 """Depth, metres, to which a path may enter an obstacle: paths along a surface have rounding."""
+LEAST_LIMIT, MOST_LIMIT = 1e-6, 1e3
+"""Range of the largest displacement of an action, metres."""
+LEAST_STRETCH, MOST_STRETCH = 1.0001, 1e6
+"""Range of `Pickers.max_stretch`; the largest is none."""
+FARTHEST = 1e6
+"""Largest coordinate of a displacement or a position, metres; limits end displacements earlier."""
+MOST_STEPS = 10_000_000
+"""Most time steps of an action."""
 TOUCHES = 16
 """Steps in the search for the first touch of a path; one that needs more ends before it."""
 
@@ -22,6 +33,10 @@ TOUCHES = 16
 @dataclass(frozen=True)
 class Actions:
     """A plan: the particle and the displacement of each picker (Eq. 1 of the paper).
+
+    `require_actions` refuses a plan with other ids or displacements where their values are known.
+    Under `jit` and `vmap` they are not: there a picker with another id grasps nothing, and a
+    displacement that is not finite makes the rollout not finite, which a search counts as failed.
 
     Attributes:
         pick: particle ids, or `NONE`, shape (T, G), or (G,) for one action.
@@ -59,16 +74,84 @@ def make_pickers(
     """Pickers with the stretch rule of SoftGym (1.2) and the limits of the paper's author.
 
     Raises:
-        ValueError: if a limit or the number of steps is not positive, or the stretch is not
-            above 1.
+        ValueError: if a number is out of its range.
     """
-    if len(limits) != 3 or not all(0 < limit < float("inf") for limit in limits):
-        raise ValueError(f"limits is {limits}; give three positive displacements in metres")
-    if not max_stretch > 1:
-        raise ValueError(f"max_stretch is {max_stretch}; give a ratio above 1")
-    if steps < 1:
-        raise ValueError(f"steps is {steps}; an action takes at least 1 time step")
+    require_limits(limits)
+    require_number("max_stretch", max_stretch, LEAST_STRETCH, MOST_STRETCH)
+    steps = require_count("steps", steps, 1, MOST_STEPS)
     return Pickers(jnp.asarray(limits, dtype=float), jnp.asarray(max_stretch, dtype=float), steps)
+
+
+def require_limits(limits: Any) -> None:
+    """Raise a `ValueError` unless limits are three displacements above zero, metres."""
+    if require_numbers("limits", limits, LEAST_LIMIT, MOST_LIMIT, "m").shape != (3,):
+        raise ValueError(f"limits is {limits}; give three displacements in metres, along x, y, z")
+
+
+def require_actions(actions: Any, num_particles: int, *, batch: bool = False) -> Actions:
+    """A plan as arrays, or several with a first axis `B`, checked.
+
+    Under `jit` and `vmap` shapes and types are checked; values are not known.
+
+    Args:
+        actions: what was given.
+        num_particles: number of particles of the body, `N`.
+        batch: whether there is an axis `B`.
+
+    Raises:
+        ValueError: if it is no `Actions`, its shapes do not match, `pick` is not of integers, an id
+            is neither a particle nor `NONE`, or a displacement is not finite.
+    """
+    if not isinstance(actions, Actions):
+        raise ValueError(
+            f"the plan is a {type(actions).__name__}; give Actions(pick, displacement)"
+        )
+    return checked_actions(actions.pick, actions.displacement, num_particles, batch=batch)
+
+
+def checked_actions(
+    pick: Any, displacement: Any, num_particles: int, *, batch: bool = False
+) -> Actions:
+    """`require_actions`, of the two arrays of a plan."""
+    pick, displacement = map(_as_known, (pick, displacement))
+    if pick.ndim != 2 + batch or 0 in pick.shape[-1:] or displacement.shape != (*pick.shape, 3):
+        wanted = "B, T, G" if batch else "T, G"
+        raise ValueError(
+            f"the plan has pick of shape {pick.shape} and displacement of shape "
+            f"{displacement.shape}; give shapes ({wanted}) and ({wanted}, 3)"
+        )
+    _require_ids(pick, num_particles)
+    require_metres("displacement", displacement)
+    return Actions(jnp.asarray(pick), jnp.asarray(displacement))
+
+
+def require_metres(name: str, array: Array | np.ndarray) -> None:
+    """Raise a `ValueError` if an array is known and not of metres, finite and up to `FARTHEST`."""
+    if not isinstance(array, jax.core.Tracer):
+        require_numbers(name, np.asarray(array), -FARTHEST, FARTHEST, "m")
+
+
+def _require_ids(pick: Array | np.ndarray, num_particles: int) -> None:
+    if not jnp.issubdtype(pick.dtype, jnp.integer):
+        raise ValueError(
+            f"pick is an array of {pick.dtype}; give ids of particles, as integers, and {NONE} for "
+            f"a picker that grasps nothing"
+        )
+    if isinstance(pick, jax.core.Tracer):
+        return
+    ids = np.asarray(pick)
+    wrong = np.argwhere((ids < NONE) | (ids >= num_particles))
+    if len(wrong):
+        place = tuple(wrong[0].tolist())
+        raise ValueError(
+            f"pick{list(place)} is {ids[place]}; a body of {num_particles} particles has ids 0 to "
+            f"{num_particles - 1}, and {NONE} grasps nothing"
+        )
+
+
+def _as_known(array: Any) -> Array | np.ndarray:
+    """The array itself, or one of a list."""
+    return array if hasattr(array, "dtype") else np.asarray(array)
 
 
 def speed_profile(steps: int) -> Float[Array, " steps"]:
@@ -96,7 +179,8 @@ def grasp(
     pickers name a particle, the first one holds it. Two pickers violate the stretch rule,
     C(a) < 0 of Eq. 2, if their particles would end at `max_stretch` times their rest distance or
     farther; both then hold still, so a third may violate the rule too. (On a straight path the
-    distance of two particles is convex in time, so it is never larger than at both ends.)
+    distance of two particles is convex in time, so it is never larger than at both ends.) A picker
+    holds nothing if its id is not that of a particle, be it `NONE` or out of range.
 
     Args:
         pickers: limits of the pickers' motion.

@@ -1,7 +1,7 @@
 """Rollouts: semi-implicit Euler steps of a simulation under actions, as `jax.lax.scan`.
 
 Pure functions of arrays: `jit`, `vmap`, `grad` and `scan` apply. Reverse mode uses the adjoint of
-adjoint.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`.
+adjoint.py; forward mode (`jvp`, `jacfwd`) needs `adjoint=False`, see modes.py.
 """
 
 from collections.abc import Callable
@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from jaxsimp.checks import require_count
 from jaxsimp.dynamics.adjoint import plain_steps, steps
 from jaxsimp.dynamics.contact.stepping import Moving, begin, end
-from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, speed_profile
+from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, require_actions, speed_profile
 from jaxsimp.dynamics.simulation import Simulation, State
 from jaxsimp.dynamics.step import Motion, unpack
 
@@ -35,12 +36,16 @@ def rollout(
         state: state at the start, shapes (N, 3).
         actions: the plan, shapes (T, G) and (T, G, 3).
         observe: function applied to the state at the end of each action.
-        adjoint: whether to differentiate by the adjoint of adjoint.py, in reverse mode only; False
-            leaves differentiation to JAX, in either mode, but reverse takes many times as long.
+        adjoint: whether to differentiate by the adjoint of adjoint.py: in reverse mode, and without
+            self-contact twice by `jax.hessian`. False leaves differentiation to JAX, in any mode
+            and order, but reverse takes many times as long.
 
     Returns:
         The state at the end of the last action, and the observations stacked along a first
         axis of length T; by default the positions, shape (T, N, 3).
+
+    Raises:
+        ValueError: if `require_actions` refuses the plan, or the state is of another body.
     """
     return rollout_observing(
         simulation, pickers, state, actions, lambda state, _: observe(state), adjoint=adjoint
@@ -57,6 +62,8 @@ def rollout_observing(
     adjoint: bool = True,
 ) -> tuple[State, PyTree[Any]]:
     """`rollout`, but `observe` takes the state at the end of each action, and the action."""
+    _require_state(simulation, state)
+    actions = require_actions(actions, len(simulation.mass))
     run = steps if adjoint else plain_steps
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
@@ -67,20 +74,33 @@ def rollout_observing(
         moving = run(simulation, moving, motion, speed_profile(pickers.steps))
         return moving, observe(end(simulation, moving), action)
 
-    try:
-        moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
-    except TypeError as error:
-        if "custom_vjp" in str(error):
-            error.add_note("the adjoint is for reverse mode: pass adjoint=False to rollout")
-        raise
+    moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
     return end(simulation, moving), observations
 
 
 def settle(simulation: Simulation, state: State, num_steps: int) -> State:
-    """The state after `num_steps` time steps with nothing held."""
+    """The state after `num_steps` time steps with nothing held.
+
+    Raises:
+        ValueError: if `num_steps` is no whole number, or the state is of another body.
+    """
+    _require_state(simulation, state)
+    num_steps = require_count("num_steps", num_steps, 0)
     moving = begin(simulation, state)
     held = jnp.zeros(len(state.position), dtype=bool)
     drive = jnp.zeros_like(state.position.T)
     share = jnp.zeros(num_steps, dtype=drive.dtype)
     moving = steps(simulation, moving, Motion(held, drive), share)
     return end(simulation, moving)
+
+
+def _require_state(simulation: Simulation, state: State) -> None:
+    """Raise a `ValueError` unless a state is of the simulated body."""
+    wanted = (len(simulation.mass), 3)
+    for name in ("position", "velocity"):
+        found = jnp.shape(getattr(state, name))
+        if found != wanted:
+            raise ValueError(
+                f"the state has {name} of shape {found}; this body of {wanted[0]} particles needs "
+                f"shape {wanted}"
+            )

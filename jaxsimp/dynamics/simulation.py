@@ -10,12 +10,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp.bodies import Body
+from jaxsimp.checks import as_reals, require_number
 from jaxsimp.dynamics.contact.obstacles import Obstacle, Table, has_table, make_obstacles
 from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_contact
 from jaxsimp.dynamics.springs import Springs, make_springs
 
 PHYSICS = ("mass", "radius", "drag", "friction", "gravity", "time_step", "obstacles")
 """Fields of `Simulation`, besides springs, with a cotangent: velocities depend on them."""
+MOST_GRAVITY = 1e3
+"""Largest gravity, up or down, metres per second squared."""
 
 
 @partial(
@@ -102,11 +105,14 @@ def make_simulation(
 
     Raises:
         ValueError: if the time step is not positive, or is unstable for the body's stiffness,
-            damping, drag and mass; if gravity is not finite; if an obstacle is too small for the
-            body's spacing or has a number out of its range; or if the body has no thickness, or
+            damping, drag and mass; if gravity or a number of an obstacle is out of its range; if an
+            obstacle is too small for the body's spacing; or if the body has no thickness, or
             pickers are too fast, for self-contact.
     """
     largest = largest_time_step(body)
+    given = as_reals(time_step)
+    if given is None or given.ndim:
+        require_number("time_step", time_step, 0.0, largest, "s")
     if not 0 < time_step <= largest:
         # Round down, so that the time step in the message is stable.
         raise ValueError(
@@ -114,8 +120,7 @@ def make_simulation(
             f"{largest * (1 - 5e-4):.4g} s. Take a smaller time step, a lower stiffness or "
             f"damping, or a larger mass"
         )
-    if not np.isfinite(gravity):
-        raise ValueError(f"gravity is {gravity}; give a finite acceleration")
+    require_number("gravity", gravity, -MOST_GRAVITY, MOST_GRAVITY, "m/s^2, downward")
 
     def array(value: float | np.ndarray) -> Array:
         return jnp.asarray(value, dtype=float)

@@ -10,6 +10,7 @@ from jaxsimp.engines.engine import (
     then_idle,
 )
 from jaxsimp.engines.ensemble import Ensemble, Spread, make_ensemble
+from jaxsimp.engines.goals import GoalScores, goal_scores
 from jaxsimp.engines.mjx import MJX, compare_with_mjx
 from jaxsimp.engines.mujoco import MuJoCo, replay
 from jaxsimp.engines.population import Layout, PopulationMap, default_layout
@@ -23,6 +24,7 @@ __all__ = [
     "Execution",
     "ExecutionStatus",
     "Executor",
+    "GoalScores",
     "Layout",
     "MassSprings",
     "MuJoCo",
@@ -33,6 +35,7 @@ __all__ = [
     "Spread",
     "compare_with_mjx",
     "default_layout",
+    "goal_scores",
     "make_ensemble",
     "plan_cost",
     "replay",

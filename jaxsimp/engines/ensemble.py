@@ -14,12 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxsimp.checks import require_choice, require_count, require_number, require_seed
 from jaxsimp.dynamics import Actions, Simulation, State, rollout_observing
 from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.rollouts import RolloutExecutor
 from jaxsimp.engines.springs import MassSprings, Physics, spring_chunk_size
 from jaxsimp.tasks import Task
 
+MOST_SPREAD, MOST_MEMBERS, MOST_CAUTION = 1e6, 10_000, 1e3
+"""Largest factor of a spread, size of an ensemble, and caution."""
 MOST_REFINEMENT = 4.0
 """Largest ratio of the task's time step to the ensemble's; a spread that needs more is an error."""
 
@@ -52,10 +55,7 @@ class Spread:
 
     def __post_init__(self) -> None:
         for name, factor in dataclasses.asdict(self).items():
-            if not 1 <= factor < np.inf:
-                raise ValueError(
-                    f"{name} is {factor}; a spread is the largest factor up or down, 1 or more"
-                )
+            require_number(name, factor, 1.0, MOST_SPREAD)
 
 
 QUANTITIES = tuple(field.name for field in dataclasses.fields(Spread))
@@ -85,10 +85,8 @@ class Ensemble:
     caution: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.statistic not in ("mean", "worst"):
-            raise ValueError(f'statistic is {self.statistic}; give "mean" or "worst"')
-        if not 0 <= self.caution < np.inf:
-            raise ValueError(f"caution is {self.caution}; give a finite number, zero or more")
+        require_choice("statistic", self.statistic, ("mean", "worst"))
+        require_number("caution", self.caution, 0.0, MOST_CAUTION)
         if self.statistic == "worst" and self.caution:
             raise ValueError(f"caution is {self.caution}; it goes with the mean, not the worst")
 
@@ -181,8 +179,7 @@ def make_ensemble(
             shorter than the task's by a factor above `MOST_REFINEMENT`; see also `Ensemble`, and
             `Task.simulation` for self-contact.
     """
-    if size < 1:
-        raise ValueError(f"size is {size}; an ensemble has at least 1 member")
+    size, seed = require_count("size", size, 1, MOST_MEMBERS), require_seed(seed)
     spread = spread or Spread()
     factors = draw_factors(size, seed, spread)
     members = [_scaled_task(task, dict(zip(QUANTITIES, row, strict=True))) for row in factors]

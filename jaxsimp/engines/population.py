@@ -18,7 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from jaxsimp.checks import require_count
 from jaxsimp.machine import num_cores
+
+MOST_WORKERS = 10_000
+"""Most threads."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +42,8 @@ class Layout:
     num_workers: int = 1
 
     def __post_init__(self) -> None:
-        if self.chunk_size < 1 or self.num_workers < 1:
-            raise ValueError(
-                f"chunk_size is {self.chunk_size} and num_workers {self.num_workers}; "
-                f"both must be at least 1"
-            )
+        require_count("chunk_size", self.chunk_size, 1)
+        require_count("num_workers", self.num_workers, 1, MOST_WORKERS)
 
 
 def default_layout(population: int, chunk_size: int) -> Layout:

@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxsimp.dynamics import NONE, Actions, State, at_rest
+from jaxsimp.dynamics.pickers import require_actions
 from jaxsimp.engines.engine import Execution, ExecutionStatus, SearchEngine, then_idle
 from jaxsimp.engines.population import Layout, PopulationMap
 from jaxsimp.tasks import Episode, Task, score
+from jaxsimp.tasks.episode import require_episode
 
 
 def plan_cost(
@@ -21,7 +23,11 @@ def plan_cost(
 
     The terminal cost is that of the state one action's duration after the pickers have let go.
     The paper sums the same cost over all steps (section IV-A).
+
+    Raises:
+        ValueError: if the plan is not of the body, see `jaxsimp.dynamics.Actions`.
     """
+    actions = require_actions(actions, task.body.num_particles)
     terminal_cost: object = task.terminal_cost
     is_one_cost = task.running_cost is terminal_cost  # which is then taken once
 
@@ -40,10 +46,34 @@ def plan_cost(
 def settled_score(
     task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
 ) -> Float[Array, ""]:
-    """Score of the settled state after a plan."""
+    """Score of the settled state after a plan.
+
+    Raises:
+        ValueError: if the plan is not of the body, see `jaxsimp.dynamics.Actions`.
+    """
+    actions = require_actions(actions, task.body.num_particles)
     followed = then_idle(actions, task.settle_actions)
     final, _ = engine.rollout(physics, at_rest(episode.start), followed, lambda *_: ())
     return score(task, episode, final.position)
+
+
+def require_plan(task: Task, actions: Actions, *, batch: bool = False) -> Actions:
+    """A plan of a task as arrays, or several with a first axis `B`, checked.
+
+    Raises:
+        ValueError: if `jaxsimp.dynamics.pickers.require_actions` raises, or the numbers of actions
+            and pickers are not those of the task.
+    """
+    actions = require_actions(actions, task.body.num_particles, batch=batch)
+    found, wanted = actions.pick.shape[-2:], (task.num_actions, task.num_pickers)
+    if found != wanted:
+        raise ValueError(
+            f"the plan has {found} actions and pickers, and {task.name} takes {wanted}; give a "
+            f"plan of the task, or the task another num_actions"
+        )
+    if not actions.pick.size:
+        raise ValueError("there are no plans; give at least one")
+    return actions
 
 
 class RolloutExecutor:
@@ -72,18 +102,15 @@ class RolloutExecutor:
         """Carry out a plan, let the body settle, and score it.
 
         Raises:
-            ValueError: if the numbers of actions and pickers are not those of the task.
+            ValueError: if the episode or the plan is not of the task.
         """
-        wanted = self._task.num_actions, self._task.num_pickers
-        if actions.pick.shape != wanted:
-            raise ValueError(
-                f"the plan has {actions.pick.shape} actions and pickers, and {self._task.name} "
-                f"takes {wanted}; give a plan of the task, or the task another num_actions"
-            )
+        require_episode(episode, self._task.body.num_particles)
+        actions = require_plan(self._task, actions)
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
         shared = (self._physics, as_float(episode))
         (positions,), (value,), (missed,) = self._compiled(shared, one)
-        fine = bool(np.isfinite(positions).all() and np.isfinite(value))
+        # The score of a free start is minus infinity where the end costs something.
+        fine = bool(np.isfinite(positions).all() and not np.isnan(value))
         status = ExecutionStatus.FINE if fine else ExecutionStatus.UNSTABLE
         return Execution(positions, float(value), status, missed=int(missed))
 

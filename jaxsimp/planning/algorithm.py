@@ -20,6 +20,8 @@ Wants = Literal["cost", "gradient", "settled"]
 """Kind of evaluation that an algorithm asks for: the cost of a plan; the cost and its gradient; or
 1 minus the score of the settled state, in the evaluator's physics."""
 
+MOST_PLANS = 1_000_000
+"""Most plans in a question, and most questions."""
 PRICES: dict[Wants, int] = {"cost": 1, "gradient": 6, "settled": 4}
 """Price of one evaluation by its kind, in rollouts. Measured without self-contact on a CPU: a
 gradient takes the time of 4.7 to 6 rollouts, a rollout with self-contact that of about 4."""
@@ -117,19 +119,37 @@ class Sequence:
         algorithms: the algorithms in order, at least one.
 
     Raises:
-        ValueError: if there is no algorithm.
+        ValueError: if there is no algorithm, or one is none.
     """
 
     algorithms: tuple[Algorithm, ...]
 
     def __post_init__(self) -> None:
-        if not self.algorithms:
-            raise ValueError("algorithms is empty; give at least one algorithm")
+        if isinstance(self.algorithms, list):  # algorithms are keys of what is compiled
+            object.__setattr__(self, "algorithms", tuple(self.algorithms))
+        if not isinstance(self.algorithms, tuple) or not self.algorithms:
+            raise ValueError(f"algorithms is {self.algorithms!r}; give a tuple of at least one")
+        for each in self.algorithms:
+            _require_algorithm(each)
 
 
 def stages(algorithm: Algorithm | Sequence) -> tuple[Algorithm, ...]:
-    """The algorithms of a sequence, or the single algorithm given."""
-    return algorithm.algorithms if isinstance(algorithm, Sequence) else (algorithm,)
+    """The algorithms of a sequence, or the single algorithm given.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    if isinstance(algorithm, Sequence):
+        return algorithm.algorithms
+    _require_algorithm(algorithm)
+    return (algorithm,)
+
+
+def _require_algorithm(algorithm: Any) -> None:
+    if isinstance(algorithm, type) or not isinstance(algorithm, Algorithm):
+        raise ValueError(
+            f"{algorithm!r} is no algorithm; give CEM() or another, or a Sequence of them"
+        )
 
 
 def price(algorithm: Algorithm | Sequence) -> int:

@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from jaxsimp.planning.algorithm import Defaults, Told
+from jaxsimp.checks import require_choice, require_count, require_number
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.encodings import Categorical, Encoding
 from jaxsimp.planning.space import ActionSpace, Plans
@@ -77,16 +77,15 @@ class CEM(Defaults):
 
     def __post_init__(self) -> None:
         for name in ("num_iterations", "population", "initial_populations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
-        if not 0 < self.elite_fraction <= 1:
-            raise ValueError(f"elite_fraction is {self.elite_fraction}; give above 0, at most 1")
-        if not 0 <= self.smoothing < 1:
-            raise ValueError(f"smoothing is {self.smoothing}; give at least 0 and less than 1")
-        if not 0 < self.initial_spread < np.inf:
-            raise ValueError(f"initial_spread is {self.initial_spread}; give a number above 0")
-        if self.returns not in ("best", "mean"):
-            raise ValueError(f'returns is {self.returns}; give "best" or "mean"')
+            require_count(name, getattr(self, name), 1, MOST_PLANS)
+        require_number("elite_fraction", self.elite_fraction, 1e-6, 1.0)
+        require_number("smoothing", self.smoothing, 0.0, 0.999)
+        require_number("initial_spread", self.initial_spread, 1e-6, 1e3, "limits")
+        require_choice("returns", self.returns, ("best", "mean"))
+        if isinstance(self.encoding, type) or not isinstance(self.encoding, Encoding):
+            raise ValueError(
+                f"encoding is {self.encoding!r}; give Categorical(), Joint() or GaussianIndex()"
+            )
 
     @property
     def num_asks(self) -> int:

@@ -10,10 +10,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import PRNGKeyArray, PyTree
 
-from jaxsimp.planning.algorithm import Defaults, Told, Wants
+from jaxsimp.checks import require_count, require_number
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, Wants
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 
@@ -55,10 +55,8 @@ class Descent(Defaults):
 
     def __post_init__(self) -> None:
         for name in ("num_asks", "num_starts"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
-        if not 0 < self.learning_rate < np.inf:
-            raise ValueError(f"learning_rate is {self.learning_rate}; give a number above 0")
+            require_count(name, getattr(self, name), 1, MOST_PLANS)
+        require_number("learning_rate", self.learning_rate, 1e-6, 10.0, "limits")
 
     @property
     def num_plans(self) -> int:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
+from jaxsimp.checks import require_number
 from jaxsimp.planning.space import ActionSpace, Plans
 
 
@@ -206,11 +207,18 @@ class Joint(ChoiceAndDirection):
     slots is drawn uniformly from all choices and displacements, whatever the distribution (a
     defensive mixture: Hesterberg, "Weighted average importance sampling and defensive mixture
     distributions", Technometrics, 1995).
+
+    Raises:
+        ValueError: if a number is out of its range.
     """
 
     name: str = "joint"
     borrowed: float = 0.5
     fresh: float = 0.05
+
+    def __post_init__(self) -> None:
+        require_number("borrowed", self.borrowed, 1e-6, 1e6, "elites")
+        require_number("fresh", self.fresh, 0.0, 1.0)
 
     def init(self, space: ActionSpace, spread: float) -> ChoiceAndGaussian:
         """Every choice equally likely; displacements of mean 0."""

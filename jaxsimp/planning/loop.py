@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree, Shaped
 
+from jaxsimp.checks import require_count
 from jaxsimp.dynamics import Actions
 from jaxsimp.planning.algorithm import Algorithm, Sequence, Told, Wants, stages
 from jaxsimp.planning.archive import Archive, archived, empty_archive
@@ -93,7 +94,12 @@ def optimize(
         key: key of the random draws.
         batch: number of plans evaluated at a time under one `vmap`; by default all plans of a
             question.
+
+    Raises:
+        ValueError: if the key is no key, or `batch` is no number of plans.
     """
+    if batch is not None:
+        require_count("batch", batch, 1)
     space = problem.space
 
     def run_stage(
@@ -129,6 +135,7 @@ def search(
         evaluate: function that evaluates one plan, for an algorithm whose answer is not the best
             plan.
     """
+    _require_key(key)
     archive, failed = empty_archive(space, archive_size(algorithm)), jnp.zeros((), jnp.int32)
     records = []
     for index, stage in enumerate(stages(algorithm)):
@@ -143,6 +150,15 @@ def search(
         failed = failed + jnp.isinf(cost)
     best_costs = jnp.concatenate([costs for costs, _ in records])
     return Optimum(actions, cost, archive, best_costs, tuple(trace for _, trace in records), failed)
+
+
+def _require_key(key: Any) -> None:
+    """Raise a `ValueError` unless it is one key, of the new or the old kind."""
+    kind, shape = getattr(key, "dtype", None), np.shape(key)
+    is_new = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key) and shape == ()
+    if not is_new and not (kind == jnp.uint32 and len(shape) == 1):
+        told = f"{kind} of shape {shape}" if kind is not None else repr(key)
+        raise ValueError(f"key is {told}; give one key, as made by jax.random.key(seed)")
 
 
 def archive_size(algorithm: Algorithm | Sequence) -> int:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxsimp.checks import require_seed
 from jaxsimp.dynamics import NONE, Actions
 from jaxsimp.engines import (
     Engine,
@@ -22,7 +23,7 @@ from jaxsimp.engines import (
     SearchEngine,
     default_layout,
 )
-from jaxsimp.engines.rollouts import as_float
+from jaxsimp.engines.rollouts import as_float, require_plan
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence, Told, Wants, stages
 from jaxsimp.planning.cem import CEM
 from jaxsimp.planning.host import compiled_exchanges, search_on_host
@@ -30,6 +31,7 @@ from jaxsimp.planning.loop import Optimum, archive_size, evaluation
 from jaxsimp.planning.problem import Candidates, TaskProblem, action_space, make_problem
 from jaxsimp.planning.space import ActionSpace
 from jaxsimp.tasks import Episode, Task
+from jaxsimp.tasks.episode import require_episode
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +87,18 @@ class Planner:
             ValueError: if the engine cannot carry out plans of the task.
         """
         self.task, self.layout = task, layout
+        for name, given, protocol in (
+            ("engine", engine, SearchEngine),
+            ("evaluator", evaluator, Engine),
+        ):
+            if given is not None and not (_is_object(given) and isinstance(given, protocol)):
+                raise ValueError(
+                    f"{name} is {given!r}; give an engine, as MassSprings(self_contact=True)"
+                )
         self.engine = engine or MassSprings()
         self.evaluator = evaluator or MassSprings(self_contact=True)
+        if layout is not None and not isinstance(layout, Layout):
+            raise ValueError(f"layout is {layout!r}; give Layout(chunk_size, num_workers), or None")
         self._maps: dict[tuple[Wants, int], tuple[TaskProblem, PopulationMap]] = {}
         # Evaluations do not depend on the candidates.
         self._problem = self._host_problem(None)
@@ -109,10 +121,12 @@ class Planner:
             on_ask: function called after each question of the algorithm.
 
         Raises:
-            ValueError: if a candidate is not a particle of the body, or the algorithm asks for
-                settled scores and the evaluator is not an engine in JAX.
+            ValueError: if a candidate is not a particle of the body, the episode is not of the
+                body, the seed is none, or the algorithm asks for settled scores and the evaluator
+                is not an engine in JAX.
         """
-        algorithm = algorithm or CEM()
+        algorithm, seed = algorithm or CEM(), require_seed(seed)
+        require_episode(episode, self.task.body.num_particles)
         space = action_space(self.task, candidates)
         compile_seconds = self.prepare(algorithm, space)
         bill = _Bill(partial(self._told, as_float(episode)), _largest_population(algorithm))
@@ -152,7 +166,12 @@ class Planner:
         Args:
             episode: start and goal.
             actions: the plans, shapes (B, T, G) and (B, T, G, 3).
+
+        Raises:
+            ValueError: if the episode is not of the body, or `require_plan` refuses the plans.
         """
+        require_episode(episode, self.task.body.num_particles)
+        actions = require_plan(self.task, actions, batch=True)
         sizes = [
             size for wants, size in self._maps if wants == "cost" and size >= len(actions.pick)
         ]
@@ -174,7 +193,11 @@ class Planner:
         return seconds
 
     def execute(self, episode: Episode, actions: Actions) -> Execution:
-        """Carry out a plan in the evaluator's physics, let the body settle, and score it."""
+        """Carry out a plan in the evaluator's physics, let the body settle, and score it.
+
+        Raises:
+            ValueError: if the episode or the plan is not of the task.
+        """
         return self._executor(episode, actions)
 
     @cached_property
@@ -236,6 +259,11 @@ class Planner:
             self.task, np.zeros(1, int), Episode(goal, goal), self.engine, evaluator
         )
         return dataclasses.replace(found, episode=as_float(found.episode))
+
+
+def _is_object(given: object) -> bool:
+    """Whether it is no class: a class has the functions of its objects, too."""
+    return not isinstance(given, type)
 
 
 def _largest_population(algorithm: Algorithm | Sequence) -> int:

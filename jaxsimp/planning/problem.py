@@ -15,6 +15,7 @@ from jaxsimp.planning.algorithm import Wants
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints
 from jaxsimp.tasks import Episode, Task
+from jaxsimp.tasks.episode import require_episode
 
 Candidates = KeyPoints | Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]
 """Particles that a picker may grasp: key points, ids, or a mask of the body's particles."""
@@ -111,11 +112,12 @@ def make_problem(
         evaluator: engine that scores settled states; needed by algorithms that ask for them.
 
     Raises:
-        ValueError: if a candidate is not a particle of the body, or an engine cannot carry out
-            plans of the task.
+        ValueError: if a candidate is not a particle of the body, the episode is not of the body,
+            or an engine cannot carry out plans of the task.
     """
     engine = engine or MassSprings()
-    episode = episode or task.episode_fn(0)
+    episode = task.episode_fn(0) if episode is None else episode
+    require_episode(episode, task.body.num_particles)
     return TaskProblem(
         space=action_space(task, candidates),
         episode=jax.tree.map(partial(jnp.asarray, dtype=float), episode),

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import jax
 from jaxtyping import PRNGKeyArray
 
-from jaxsimp.planning.algorithm import Defaults, Told
+from jaxsimp.checks import require_count
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 
@@ -27,8 +28,7 @@ class RandomShooting(Defaults):
 
     def __post_init__(self) -> None:
         for name in ("num_asks", "num_plans"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; at least 1 is needed")
+            require_count(name, getattr(self, name), 1, MOST_PLANS)
 
     def init(self, space: ActionSpace, archive: Archive) -> tuple[()]:
         """The empty state."""

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxsimp.planning.algorithm import Defaults, Told, Wants
+from jaxsimp.checks import require_count
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, Wants
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 
@@ -37,8 +38,7 @@ class Reranking(Defaults):
     wants: Wants = "settled"
 
     def __post_init__(self) -> None:
-        if self.num_starts < 1:
-            raise ValueError(f"num_starts is {self.num_starts}; at least 1 is needed")
+        require_count("num_starts", self.num_starts, 1, MOST_PLANS)
 
     @property
     def num_asks(self) -> int:

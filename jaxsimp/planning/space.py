@@ -66,7 +66,12 @@ def as_candidates(
         ValueError: if there is no candidate, an id is not a particle of the body or occurs twice,
             or the array has another shape or type.
     """
-    given = np.asarray(candidates)
+    try:
+        given = np.asarray(candidates)
+    except ValueError as error:  # lists of several lengths
+        raise ValueError(f"candidates is {candidates!r}; give ids of particles") from error
+    if not given.size:
+        given = np.zeros(0, dtype=int)  # an empty list is of floats
     if given.dtype == bool and given.shape == (num_particles,):
         given = np.flatnonzero(given)
     if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):

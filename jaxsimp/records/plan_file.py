@@ -15,20 +15,37 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body, Material
 from jaxsimp.dynamics import Actions, Obstacle
 from jaxsimp.dynamics.contact.obstacles import SHAPES
+from jaxsimp.dynamics.pickers import checked_actions, require_actions
 from jaxsimp.engines import Execution
 from jaxsimp.records.files import whole_file
 from jaxsimp.records.provenance import environment
 from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, task_names
+from jaxsimp.tasks.episode import require_episode
 
 SETTINGS = ("limits", "num_actions", "num_pickers", "action_seconds", "settle_actions")
 """Numbers of a task that a file stores."""
+MOST_BYTES = 2 * 10**9
+"""Most bytes that a file may unpack to; a plan of 100 actions of 100,000 particles has 250 MB."""
+UNREADABLE = (
+    ValueError,
+    EOFError,
+    TypeError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+    OverflowError,
+    SyntaxError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What damaged and foreign files raise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,30 +75,37 @@ class SavedPlan:
         since a file holds no functions.
 
         Raises:
-            ValueError: if the file is of version 0.1, which stores no task, or the task has an
-                obstacle of a shape that is not the library's.
+            ValueError: if the file is of version 0.1, which stores no task, its description of the
+                task is damaged, or the task has an obstacle of a shape that is not the library's.
         """
         if self.body is None or self.episode is None:
             raise ValueError(
                 "the plan file is of version 0.1, which keeps no task; make the task that it was "
                 "planned for by `make_task`"
             )
-        told = self.about["task"]
-        settings = {name: told[name] for name in SETTINGS} | {
-            "limits": tuple(told["limits"]),
-            "longest_time_step": told["time_step"],
-            "episode_fn": FixedStart(self.episode),
-            "obstacles": _obstacles(told),
-        }
-        if told["name"] in task_names():
-            registered = make_task(told["name"], told["resolution"])
+        try:
+            told = self.about["task"]
+            name, resolution = told["name"], told["resolution"]
+            settings = {each: told[each] for each in SETTINGS} | {
+                "limits": tuple(told["limits"]),
+                "longest_time_step": told["time_step"],
+                "episode_fn": FixedStart(self.episode),
+                "obstacles": _obstacles(told),
+            }
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                f"the plan file's description of the task is damaged ({type(error).__name__}: "
+                f"{error}); make the task by `make_task` or its own code"
+            ) from error
+        if name in task_names():
+            registered = make_task(name, resolution)
             return dataclasses.replace(registered, body=self.body, **settings)
         return Task(
             body=self.body,
             goal=np.asarray(self.episode.goal),
             running_cost=distance_cost,
             terminal_cost=distance_cost,
-            name=told["name"],
+            name=name,
             **settings,
         )
 
@@ -108,7 +132,13 @@ def save_plan(
         engine: engine of the execution; the file stores its text.
         found: further entries, as JSON, such as the search that found the plan.
         provenance: versions, commit, device and cores; `environment()` by default.
+
+    Raises:
+        ValueError: if the plan, the episode or the positions are not of the task's body.
     """
+    actions = require_actions(actions, task.body.num_particles)
+    require_episode(episode, task.body.num_particles)
+    _require_frames(execution.positions, actions, task.body.num_particles)
     about = {
         "task": _task_text(task),
         "engine": str(engine),
@@ -131,33 +161,69 @@ def save_plan(
 
 
 def load_plan(path: str | Path) -> SavedPlan:
-    """Read a plan written by `save_plan`.
+    """Read a plan written by `save_plan`. Nothing in the file is executed.
 
     Raises:
-        ValueError: if the file holds no plan.
+        ValueError: if the file holds no plan, or more than `MOST_BYTES`.
     """
     arrays = _read(Path(path))
     missing = {"pick", "displacement", "positions"} - arrays.keys()
     if missing:
         raise ValueError(f"{path} has no {', '.join(sorted(missing))}; it is not a saved plan")
-    actions = Actions(jnp.asarray(arrays["pick"]), jnp.asarray(arrays["displacement"]))
-    if "about" not in arrays:
-        return SavedPlan(actions, arrays["positions"])
     try:
-        about = json.loads(str(arrays["about"]))
-        body = _body(about["body"], arrays)
-        episode = Episode(arrays["start"], arrays["goal"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({type(error).__name__}: {error})") from error
-    return SavedPlan(actions, arrays["positions"], body, episode, about)
+        return _plan(arrays)
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        told = f"has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(
+            f"{path} is damaged ({type(error).__name__}: {told}); write the plan again with "
+            f"save_plan"
+        ) from error
+
+
+def _plan(arrays: Mapping[str, np.ndarray]) -> SavedPlan:
+    """The plan of a file's arrays."""
+    positions = arrays["positions"]
+    count = positions.shape[1] if positions.ndim == 3 else 0
+    actions = checked_actions(arrays["pick"], arrays["displacement"], count)
+    _require_frames(positions, actions, count)
+    if "about" not in arrays:
+        return SavedPlan(actions, positions)
+    about = json.loads(str(arrays["about"]))
+    if not isinstance(about, dict) or not isinstance(about["body"], dict):
+        raise ValueError("about is no description of a plan")
+    body = _body(about["body"], arrays)
+    episode = Episode(arrays["start"], arrays["goal"])
+    require_episode(episode, body.num_particles)
+    if body.num_particles != count:
+        raise ValueError(f"positions are of {count} particles, the body of {body.num_particles}")
+    return SavedPlan(actions, positions, body, episode, about)
+
+
+def _require_frames(positions: np.ndarray, actions: Actions, num_particles: int) -> None:
+    """Raise a `ValueError` unless positions are of an execution; those of a failed one are NaN."""
+    wanted = (len(actions.pick) + 2, num_particles, 3)
+    if np.shape(positions) != wanted or not np.issubdtype(np.asarray(positions).dtype, np.floating):
+        raise ValueError(
+            f"positions have shape {np.shape(positions)}; {wanted} is needed: at the start, after "
+            f"each action, and settled"
+        )
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as file:
-            return dict(np.load(file))
-    except (ValueError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+            with zipfile.ZipFile(file) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+            if size > MOST_BYTES:
+                raise ValueError(f"it unpacks to {size:,} bytes, and {MOST_BYTES:,} are allowed")
+            file.seek(0)
+            arrays = dict(np.load(file, allow_pickle=False))
+    except UNREADABLE as error:
         raise ValueError(f"{path} cannot be read ({error}); it is not a saved plan") from error
+    strange = [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]
+    if strange:
+        raise ValueError(f"{path} has {strange[0]}, which is no array; it is not a saved plan")
+    return arrays
 
 
 def _write_whole(path: Path, arrays: Mapping[str, Any]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
+from jaxsimp.checks import require_count
 from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.episode import Episode
 
@@ -33,9 +34,15 @@ class MatchingCost:
 
     Attributes:
         num_particles: number of particles of the body, `N`.
+
+    Raises:
+        ValueError: if it is no whole number above zero.
     """
 
     num_particles: int
+
+    def __post_init__(self) -> None:
+        require_count("num_particles", self.num_particles, 1)
 
     def __call__(
         self, episode: Episode, state: State, action: Actions | None = None

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
+from jaxsimp.checks import require_seed
 from jaxsimp.dynamics import (
     Actions,
     at_rest,
@@ -37,7 +38,11 @@ def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
     Args:
         body: the body; it starts straight or flat on the table.
         seed: seed of the random picks.
+
+    Raises:
+        ValueError: if the seed is none.
     """
+    seed = require_seed(seed)
     key_pick, key_move = jax.random.split(jax.random.key(seed))
     pick = jax.random.randint(key_pick, (4, 1), 0, body.num_particles)
     farthest = jnp.array([[FARTHEST]])

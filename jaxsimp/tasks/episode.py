@@ -3,12 +3,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp.dynamics import Actions, State
+from jaxsimp.dynamics.pickers import require_metres
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
@@ -23,6 +25,28 @@ class Episode:
 
     start: Float[Array | np.ndarray, "... N 3"]
     goal: Float[Array | np.ndarray, "... N 3"]
+
+
+def require_episode(episode: Any, num_particles: int) -> None:
+    """Check an episode of a body; under `jit` and `vmap` its shapes alone.
+
+    Raises:
+        ValueError: if it is no `Episode`, or its start or goal are not finite positions of
+            `num_particles` particles.
+    """
+    if not isinstance(episode, Episode):
+        raise ValueError(
+            f"the episode is a {type(episode).__name__}; give Episode(start, goal), as a task's "
+            f"episode_fn(seed) returns"
+        )
+    for name in ("start", "goal"):
+        positions = getattr(episode, name)
+        if np.shape(positions) != (num_particles, 3):
+            raise ValueError(
+                f"the {name} of the episode has shape {np.shape(positions)}; a body of "
+                f"{num_particles} particles needs shape ({num_particles}, 3)"
+            )
+        require_metres(f"the {name} of the episode", positions)
 
 
 EpisodeFn = Callable[[int], Episode]

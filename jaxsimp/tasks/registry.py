@@ -4,12 +4,12 @@ import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
-from numbers import Integral
 
+from jaxsimp.checks import require_count
 from jaxsimp.tasks.task import Task
 
-LEAST_RESOLUTION = 5
-"""Smallest number of particles along a side."""
+LEAST_RESOLUTION, MOST_RESOLUTION = 5, 10_000
+"""Smallest and largest number of particles along a side."""
 
 TaskFactory = Callable[[int], Task]
 
@@ -40,8 +40,10 @@ def register(
         group: name of a group of tasks: "paper", "goals" or "obstacles" here.
 
     Raises:
-        ValueError: if the name is taken.
+        ValueError: if the name is taken, or a resolution is out of its range.
     """
+    for name, resolution in (("full", full), ("quick", quick)):
+        require_count(name, resolution, LEAST_RESOLUTION, MOST_RESOLUTION)
 
     def add(factory: TaskFactory) -> TaskFactory:
         name = factory.__name__
@@ -81,16 +83,11 @@ def make_task(name: str, resolution: int | None = None, *, quick: bool = False) 
         quick: whether the default resolution is that of the quick scale.
 
     Raises:
-        ValueError: if there is no such task, or the resolution is not a whole number or too low.
+        ValueError: if there is no such task, or the resolution is out of its range.
     """
-    if name not in _REGISTRY:
+    if not isinstance(name, str) or name not in _REGISTRY:
         raise ValueError(f"unknown task {name!r}; choose from {', '.join(_REGISTRY)}")
     entry = _REGISTRY[name]
     if resolution is None:
         resolution = entry.quick if quick else entry.full
-    if not isinstance(resolution, Integral) or resolution < LEAST_RESOLUTION:
-        raise ValueError(
-            f"resolution is {resolution}; a task needs a whole number of particles a side, at "
-            f"least {LEAST_RESOLUTION}"
-        )
-    return entry.factory(int(resolution))
+    return entry.factory(require_count("resolution", resolution, LEAST_RESOLUTION, MOST_RESOLUTION))

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
+from jaxsimp.checks import require_seed
 from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.episode import Episode
 
@@ -53,7 +54,7 @@ class TurnedStart:
 
     def __call__(self, seed: int) -> Episode:
         """The episode of a seed."""
-        angle = np.random.default_rng(seed).uniform(-LARGEST_ANGLE, LARGEST_ANGLE)
+        angle = np.random.default_rng(require_seed(seed)).uniform(-LARGEST_ANGLE, LARGEST_ANGLE)
         return Episode(goals.flat(self.body, angle), goals.turn(self.goal, angle))
 
     def draw(self, key: PRNGKeyArray) -> Episode:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
+from jaxsimp.checks import require_count, require_number
 from jaxsimp.dynamics import (
     Obstacle,
     Pickers,
@@ -21,8 +22,14 @@ from jaxsimp.dynamics import (
     make_simulation,
 )
 from jaxsimp.dynamics.contact.obstacles import check_obstacles, has_table
-from jaxsimp.tasks.check import check_costs, check_count, check_draw, check_limits, check_seconds
+from jaxsimp.dynamics.pickers import require_limits
+from jaxsimp.tasks.check import check_costs, check_draw
 from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
+
+COUNTS = {"num_actions": (1, 10_000), "num_pickers": (1, 1000), "settle_actions": (0, 10_000)}
+"""Least and most of a task's counts."""
+SECONDS = {"action_seconds": (1e-4, 1e4), "longest_time_step": (1e-6, 1.0)}
+"""Least and most of a task's times, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +82,11 @@ class Task:
     def __post_init__(self) -> None:
         check_obstacles(self.obstacles, self.body)
         goals.check_goal(self.body, self.goal, has_table=has_table(self.obstacles))
-        check_limits(self.limits)
-        for name, least in (("num_actions", 1), ("num_pickers", 1), ("settle_actions", 0)):
-            check_count(name, getattr(self, name), least)
-        for name in ("action_seconds", "longest_time_step"):
-            check_seconds(name, getattr(self, name))
+        require_limits(self.limits)
+        for name, counts in COUNTS.items():
+            require_count(name, getattr(self, name), *counts)
+        for name, seconds in SECONDS.items():
+            require_number(name, getattr(self, name), *seconds, "s")
         check_costs(
             self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
         )
@@ -134,8 +141,18 @@ class Task:
 
     @property
     def action_steps(self) -> int:
-        """Number of time steps of one action."""
-        return round(self.action_seconds / self.time_step)
+        """Number of time steps of one action.
+
+        Raises:
+            ValueError: if an action is shorter than half a time step.
+        """
+        steps = round(self.action_seconds / self.time_step)
+        if steps < 1:
+            raise ValueError(
+                f"action_seconds is {self.action_seconds:g}, less than half a time step of "
+                f"{self.time_step:.4g} s; give longer actions, or a smaller longest_time_step"
+            )
+        return steps
 
 
 def score(

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from types import FunctionType
 
 import igl
 import jax
@@ -655,6 +656,26 @@ def test_obstacles_refuse(obstacle, message):
 def test_what_is_no_obstacle_is_refused(obstacle, message):
     with pytest.raises(ValueError, match=message):
         make_simulation(rope(5, 0.1), 1e-3, obstacles=(obstacle(),))
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("obstacles", "message"),
+    [
+        (Table(), r"obstacles is Table\(\); give a tuple of them"),
+        (
+            lambda: (Sphere(("a", 0.0, 0.0), 0.1),),
+            r"center is \('a', 0.0, 0.0\); give three finite numbers",
+        ),
+        ((Sphere((0.0, 0.0, 0.0), 1e7),), r"radius is 1e\+07; give a finite number up to 1e\+06"),
+        ((Plane((0, 0, 0), (0, 0, 1e-30)),), r"normal is .* length of 1e-06 to 1e\+06"),
+        ((Capsule((0, 0, 1), (0, 0, 1 + 1e-9), 0.1),), "start and end are both"),
+    ],
+)
+def test_what_float32_cannot_square_is_refused(obstacles, message):
+    obstacles = obstacles() if isinstance(obstacles, FunctionType) else obstacles
+    with pytest.raises(ValueError, match=message):
+        make_simulation(rope(5, 0.1), 1e-3, obstacles=obstacles)
 
 
 def thin(radius):

@@ -19,6 +19,7 @@ from jaxsimp.dynamics import (
     make_pickers,
     make_simulation,
     rollout,
+    settle,
 )
 from jaxsimp.dynamics.pickers import grasp, speed_profile
 
@@ -276,13 +277,13 @@ def test_a_picker_ends_at_rest(steps):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"limits": (0.1, 0.0, 0.1)}, r"limits is \(0.1, 0.0, 0.1\); give three positive"),
-        ({"limits": (0.1, -0.1, 0.1)}, "limits is"),
-        ({"limits": (0.1, float("nan"), 0.1)}, "limits is"),
-        ({"limits": (0.1, float("inf"), 0.1)}, "limits is"),
-        ({"max_stretch": 1.0}, "max_stretch is 1.0; give a ratio above 1"),
+        ({"limits": (0.1, 0.0, 0.1)}, r"limits\[1\] is 0; give numbers from 1e-06 to 1000 m"),
+        ({"limits": (0.1, -0.1, 0.1)}, r"limits\[1\] is -0.1"),
+        ({"limits": (0.1, float("nan"), 0.1)}, r"limits\[1\] is nan"),
+        ({"limits": (0.1, float("inf"), 0.1)}, r"limits\[1\] is inf"),
+        ({"max_stretch": 1.0}, r"max_stretch is 1.0; give a number from 1.0001"),
         ({"max_stretch": float("nan")}, "max_stretch is nan"),
-        ({"steps": 0}, "steps is 0; an action takes at least 1 time step"),
+        ({"steps": 0}, "steps is 0; give a whole number from 1"),
     ],
 )
 def test_pickers_refuse(arguments, message):
@@ -292,5 +293,90 @@ def test_pickers_refuse(arguments, message):
 
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_pickers_refuse_limits_that_are_not_three():
-    with pytest.raises(ValueError, match=r"limits is \(0.1, 0.1\); give three positive"):
+    with pytest.raises(ValueError, match=r"limits is \(0.1, 0.1\); give three displacements"):
         make_pickers((0.1, 0.1))
+
+
+# --- the door ------------------------------------------------------------------------------------
+
+
+MOVE = np.full((1, 2, 3), 0.01)
+BOTH = np.array([[0, 4]])
+WRONG = {
+    "too large": (
+        np.array([[0, 5]]),
+        MOVE,
+        r"pick\[0, 1\] is 5; a body of 5 .* ids 0 to 4",
+    ),
+    "beyond 32 bits": (np.array([[2**40, 0]]), MOVE, rf"pick\[0, 0\] is {2**40}; a body of 5"),
+    "negative": (np.array([[NONE, -7]]), MOVE, r"pick\[0, 1\] is -7; a body of 5"),
+    "floats": (np.array([[0.0, 1.0]]), MOVE, "pick is an array of float64; give ids of particles"),
+    "a mask": (np.array([[True, False]]), MOVE, "pick is an array of bool; give ids"),
+    "nan": (BOTH, MOVE * np.nan, r"displacement\[0, 0, 0\] is nan; give numbers from"),
+    "infinite": (BOTH, MOVE * np.inf, r"displacement\[0, 0, 0\] is inf; give numbers from"),
+    "far away": (BOTH, MOVE * 1e9, r"is 1e\+07; give numbers from -1e\+06 to 1e\+06 m"),
+    "one for two": (BOTH, MOVE[:, :1], r"\(1, 2\) and displacement of shape \(1, 1, 3\); give"),
+    "one action": (BOTH[0], MOVE[0], r"give shapes \(T, G\) and \(T, G, 3\)"),
+    "no picker": (BOTH[:, :0], MOVE[:, :0], r"pick of shape \(1, 0\).*give shapes"),
+}
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("name", WRONG)
+def test_a_plan_that_names_nothing_of_the_body_is_refused(name):
+    *arrays, message = WRONG[name]
+    body = rope(5, 0.1)
+    simulation, start = make_simulation(body, 1e-3), at_rest(goals.straight(body))
+    with pytest.raises(ValueError, match=message):
+        rollout(simulation, make_pickers(steps=2), start, Actions(*arrays))
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_what_is_no_plan_and_a_state_of_another_body_are_refused():
+    simulation, pickers = make_simulation(rope(5, 0.1), 1e-3), make_pickers(steps=2)
+    with pytest.raises(ValueError, match=r"the plan is a dict; give Actions\(pick, displacement\)"):
+        rollout(simulation, pickers, at_rest(np.zeros((5, 3))), {"pick": 0})
+    other = at_rest(np.zeros((4, 3)))
+    idle = Actions(jnp.full((1, 2), NONE), jnp.zeros((1, 2, 3)))
+    message = r"position of shape \(4, 3\); this body of 5 .*\(5, 3\)"
+    with pytest.raises(ValueError, match=message):
+        rollout(simulation, pickers, other, idle)
+    with pytest.raises(ValueError, match=message):
+        settle(simulation, other, 1)
+    with pytest.raises(ValueError, match="num_steps is -1; give a whole number of at least 0"):
+        settle(simulation, at_rest(np.zeros((5, 3))), -1)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_plan_of_no_actions_and_of_lists_is_one():
+    body = rope(5, 0.1)
+    simulation, pickers = make_simulation(body, 1e-3), make_pickers(steps=2)
+    start = at_rest(goals.straight(body))
+    none = Actions(np.zeros((0, 1), int), np.zeros((0, 1, 3)))
+    final, seen = rollout(simulation, pickers, start, none)
+    np.testing.assert_array_equal(final.position, start.position)
+    assert seen.shape == (0, 5, 3)
+    by_lists, _ = rollout(simulation, pickers, start, Actions([[0]], [[[0.01, 0.0, 0.0]]]))
+    by_arrays = Actions(jnp.array([[0]]), jnp.array([[[0.01, 0.0, 0.0]]]))
+    wanted, _ = rollout(simulation, pickers, start, by_arrays)
+    np.testing.assert_array_equal(by_lists.position, wanted.position)
+
+
+def test_under_jit_an_id_out_of_range_grasps_nothing_and_a_displacement_of_nan_fails_alone():
+    body = rope(5, 0.1)
+    simulation, pickers = make_simulation(body, 1e-3), make_pickers(steps=2)
+    start = at_rest(goals.straight(body))
+
+    @jax.jit
+    @jax.vmap
+    def run(pick, move):
+        return rollout(simulation, pickers, start, Actions(pick, move))[0].position
+
+    picks = jnp.array([[[NONE, NONE]], [[99, NONE]], [[-7, 2**31 - 1]], [[0, 99]], [[0, 4]]])
+    moves = jnp.broadcast_to(jnp.asarray(MOVE, float), (5, 1, 2, 3)).at[4].set(jnp.nan)
+    idle, above, below, one, failed = np.asarray(run(picks, moves))
+    np.testing.assert_array_equal(above, idle)
+    np.testing.assert_array_equal(below, idle)
+    # The other picker carries on.
+    np.testing.assert_allclose(one[0], idle[0] + 0.01, atol=1e-6)
+    assert np.isnan(failed).any()

@@ -840,13 +840,3 @@ def test_what_is_compiled_for_a_gpu_calls_nothing_of_a_cpu():
         sums = [each for each in scatters if "stablehlo.add" in each]
         assert len(sums) == (function is gradient)
         assert "jaxsimp_touch" in traced.lower(lowering_platforms=("cpu",)).as_text()
-
-
-@pytest.mark.usefixtures("once")
-def test_forward_mode_is_told_what_to_pass():
-    simulation, pickers, position, displacement = laid_over()
-    run = partial(colliding_rollout, simulation, pickers, at_rest(position))
-    move = jnp.asarray(displacement, jnp.float32)
-    with pytest.raises(TypeError) as refused:
-        jax.jvp(run, (move,), (move,))
-    assert "adjoint=False" in " ".join(refused.value.__notes__)

@@ -19,7 +19,7 @@ from jaxsimp.engines import (
 )
 from jaxsimp.engines.rollouts import RolloutExecutor
 from jaxsimp.planning import CEM, Planner, Reranking, Sequence, action_space, price
-from jaxsimp.tasks import make_task
+from jaxsimp.tasks import Episode, make_task
 
 ALGORITHM = CEM(num_iterations=8, population=32, initial_populations=2)
 
@@ -201,19 +201,39 @@ def test_plans_are_ranked_by_what_the_evaluator_makes_of_them():
     assert plan.price == price(algorithm) + 1
 
 
-@pytest.mark.parametrize("move", [np.nan, np.inf])
 @pytest.mark.parametrize("self_contact", [False, True])
-def test_a_simulation_that_is_not_finite_is_a_status(move, self_contact):
+def test_a_simulation_that_is_not_finite_is_a_status(self_contact):
     task = make_task("rope_folding", 7)
     task = dataclasses.replace(task, num_actions=1, settle_actions=1)
-    moves = jnp.full((1, 2, 3), move)
-    execute = MassSprings(self_contact).executor(task)
-    done = execute(task.episode_fn(0), Actions(jnp.array([[0, NONE]]), moves))
-    fine = np.isfinite(done.positions).all() and np.isfinite(done.score)
-    assert done.status == (ExecutionStatus.FINE if fine else ExecutionStatus.UNSTABLE)
-    # An infinite move is clipped to the limits; what is no number cannot be.
-    assert fine == np.isinf(move)
-    assert np.isfinite(done.positions[0]).all()
+    engine, idle = MassSprings(self_contact), jnp.full((1, 2), NONE)
+    simulation, pickers = engine.physics(task)
+    broken = dataclasses.replace(simulation, gravity=jnp.asarray(jnp.nan)), pickers
+    for physics, status in (
+        ((simulation, pickers), ExecutionStatus.FINE),
+        (broken, ExecutionStatus.UNSTABLE),
+    ):
+        execute = RolloutExecutor(task, engine, physics)
+        done = execute(task.episode_fn(0), Actions(idle, jnp.zeros((1, 2, 3))))
+        assert done.status == status
+        assert np.isfinite(done.positions[0]).all()
+        assert np.isnan(done.score) == (status == ExecutionStatus.UNSTABLE)
+
+
+@pytest.mark.parametrize("self_contact", [False, True])
+@pytest.mark.parametrize("move", [np.nan, np.inf])
+def test_an_executor_refuses_a_plan_that_is_not_finite(move, self_contact):
+    task = dataclasses.replace(make_task("rope_folding", 7), num_actions=1)
+    plan = Actions(jnp.array([[0, NONE]]), jnp.full((1, 2, 3), move))
+    with pytest.raises(ValueError, match=rf"displacement\[0, 0, 0\] is {move}; give numbers"):
+        MassSprings(self_contact).executor(task)(task.episode_fn(0), plan)
+
+
+def test_a_free_start_that_ends_at_a_cost_is_fine_and_scores_minus_infinity():
+    task = dataclasses.replace(make_task("rope_letter_u", 7), num_actions=1, settle_actions=0)
+    start = np.asarray(task.episode_fn(0).start)
+    plan = Actions(jnp.array([[0, NONE]]), jnp.full((1, 2, 3), 0.05))
+    done = MassSprings().executor(task)(Episode(start, start), plan)
+    assert (done.status, done.score) == (ExecutionStatus.FINE, -np.inf)
 
 
 def test_a_planner_executes_in_mujoco():

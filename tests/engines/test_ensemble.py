@@ -289,7 +289,7 @@ def test_no_spread_makes_equal_members():
 @pytest.mark.parametrize("name", QUANTITIES)
 @pytest.mark.parametrize("factor", [-2.0, 0.0, 0.99, np.inf, np.nan])
 def test_a_spread_below_one_is_refused(name, factor):
-    with pytest.raises(ValueError, match=f"{name} is {factor}; .* 1 or more"):
+    with pytest.raises(ValueError, match=f"^{name} is {factor}; give a number from 1 to"):
         Spread(**{name: factor})
 
 
@@ -299,7 +299,7 @@ def test_a_spread_that_is_stable_at_tiny_time_steps_only_is_refused():
 
 
 def test_what_no_ensemble_can_have_is_refused():
-    with pytest.raises(ValueError, match=r"size is 0; .*at least 1"):
+    with pytest.raises(ValueError, match="size is 0; give a whole number from 1"):
         make_ensemble(small_task(), 0)
     with pytest.raises(ValueError, match="caution is -1"):
         make_ensemble(small_task(), 2, caution=-1.0)
@@ -311,5 +311,5 @@ def test_what_no_ensemble_can_have_is_refused():
 
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_an_unknown_statistic_is_refused():
-    with pytest.raises(ValueError, match="statistic is median"):
+    with pytest.raises(ValueError, match="statistic is 'median'; choose from mean, worst"):
         make_ensemble(small_task(), 2, statistic="median")

@@ -12,7 +12,7 @@ from jaxsimp.engines import ExecutionStatus, Layout, replay
 from jaxsimp.engines.mujoco import model as flex
 from jaxsimp.engines.mujoco.model import VARIANTS, Variant
 from jaxsimp.planning import Planner
-from jaxsimp.tasks import make_task, score
+from jaxsimp.tasks import Episode, make_task, score
 
 
 def small_rope():
@@ -164,5 +164,10 @@ def test_wrong_requests_are_refused():
     task = small_rope()
     with pytest.raises(ValueError, match="1 episodes are given for 2 plans; give one for each"):
         replay(task, [task.episode_fn(0)], [random_plan(task, 0)] * 2)
-    with pytest.raises(ValueError, match="particle 9 cannot be grasped"):
+    with pytest.raises(ValueError, match=r"pick\[0, 0\] is 9; a body of 9 particles has"):
         one(task, plan({9: [0.0, 0.0, 0.1]}))
+    with pytest.raises(ValueError, match="num_workers is 0; give a whole number from 1"):
+        replay(task, [], [], num_workers=0)
+    start = np.array(task.episode_fn(0).start)
+    with pytest.raises(ValueError, match=r"start of the episode.* is nan"):
+        replay(task, [Episode(start * np.nan, start)], [random_plan(task, 0)])

@@ -362,14 +362,97 @@ def test_a_saved_model_is_the_same_model(body, variant, tmp_path):
 
 
 def test_unknown_variants_and_particles_are_refused():
-    with pytest.raises(ValueError, match="variant is 'soft'; choose one of fast, full"):
+    with pytest.raises(ValueError, match="variant is 'soft'; choose from fast, full"):
         make_model(rope(5), "soft")
     with pytest.raises(ValueError, match="particle 5 cannot be grasped; a body of 5 particles has"):
         make_model(rope(5), "fast", [5])
-    with pytest.raises(ValueError, match=r"time_step is 0\.0; give seconds above zero"):
+    with pytest.raises(ValueError, match=r"time_step is 0\.0; give a number from 1e-06 to 1 s"):
         Variant(0.0, elastic=True, self_collision=True)
 
 
 def test_mujoco_is_imported_when_called():
     code = "import sys, jaxsimp.engines.mujoco.execution; sys.exit('mujoco' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
+
+
+def passive_forces(body, position):
+    """Forces of the elastic model at positions, newtons."""
+    model = make_model(body, "full", obstacles=())
+    data = mujoco.MjData(model)
+    data.qpos[:] = (position - body.rest).ravel()
+    mujoco.mj_forward(model, data)
+    return data.qfrc_passive.reshape(-1, 3)
+
+
+def test_a_sheet_without_bending_stretches_as_one_with_hardly_any():
+    body = cloth((4, 4), (0.09, 0.09))
+    bends = body.families > 0  # a diagonal across an edge resists bending, too
+    some, none = (
+        dataclasses.replace(body, stiffness=np.where(bends, value, body.stiffness))
+        for value in (1e-9, 0.0)
+    )
+    stretched = body.rest * [1.1, 1.0, 1.0]
+    found, wanted = passive_forces(none, stretched), passive_forces(some, stretched)
+    np.testing.assert_allclose(found, wanted, atol=1e-5 * np.abs(wanted).max())
+    assert np.abs(wanted).max() > 1e-3
+    # A corner that is lifted a little is pulled down by bending; by stretch of third order only.
+    lifted = body.rest.copy()
+    lifted[0, 2] += 1e-4
+    free, stiff = (passive_forces(each, lifted)[0, 2] for each in (none, body))
+    assert stiff < -1e-6
+    assert abs(free) < 1e-3 * abs(stiff)
+
+
+def small(name):
+    """Bodies of few particles or little physics."""
+    line = rope(3, 0.1)
+
+    def part(count):
+        kept = (line.springs < count).all(axis=1)
+        names = ("springs", "families", "rest_length", "stiffness", "damping")
+        own = {each: getattr(line, each)[kept] for each in names}
+        return dataclasses.replace(
+            line, rest=line.rest[:count], mass=line.mass[:count], shape=(count,), **own
+        )
+
+    def unstressed(body):
+        return dataclasses.replace(body, stiffness=0.0 * body.stiffness)
+
+    makers = {
+        "a triangle": lambda: from_mesh(0.1 * np.eye(3) * [1.0, 1.0, 0.0], np.array([[0, 1, 2]])),
+        "two particles": lambda: part(2),
+        "one particle": lambda: part(1),
+        "slack sheet": lambda: unstressed(cloth((3, 3), (0.1, 0.1))),
+        "slack rope": lambda: unstressed(line),
+        "no thickness": lambda: line.scaled(thickness=0.0),
+    }
+    return makers[name]()
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [("a triangle", "full"), ("two particles", "full"), ("slack sheet", "fast")],
+)
+def test_small_and_slack_bodies_come_to_rest_on_the_table(name, variant):
+    body = small(name)
+    model = make_model(body, variant)
+    data = mujoco.MjData(model)
+    data.qpos[2::3] = body.radius + 1e-3
+    step(model, data, 0.3)
+    heights = positions(body, data)[:, 2]
+    np.testing.assert_allclose(heights, body.rest[:, 2] * 0 + body.radius, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("one particle", r"has 1 particles and 0 springs; .* at least 2 particles, joined"),
+        ("slack sheet", r"all springs of this cloth have stiffness 0; .* variant fast"),
+        ("slack rope", r"all springs of this rope have stiffness 0; .* variant fast"),
+        ("no thickness", r"thickness of this rope is 0; .* metres above zero"),
+    ],
+)
+def test_what_mujoco_has_no_elastic_body_for_is_refused(name, message):
+    with pytest.raises(ValueError, match=message):
+        make_model(small(name), "full")

@@ -126,6 +126,8 @@ BODY = "ids 0 to 8 of a body of 9 particles"
     ("wrong", "message"),
     [
         (np.array([], int), f"candidates is empty; give at least one of the {BODY}"),
+        ([], f"candidates is empty; give at least one of the {BODY}"),
+        ([[0, 1], [2]], r"candidates is \[\[0, 1\], \[2\]\]; give ids of particles"),
         (np.zeros(9, bool), f"candidates is empty; give at least one of the {BODY}"),
         (np.array([0, 9]), f"candidates names particle 9; give .*{BODY}"),
         (np.array([3, -1]), f"candidates names particle -1; give .*{BODY}"),

@@ -143,13 +143,40 @@ def test_a_search_is_seeded_improves_and_tells_what_it_returns(algorithm):
     ],
 )
 def test_settings_out_of_range_are_refused(kind, name, value):
-    with pytest.raises(ValueError, match=f"{name} is {value}; .*(at least 1|above 0)"):
+    with pytest.raises(ValueError, match=f"{name} is {value}; give .* from 1"):
         kind(**{name: value})
 
 
 def test_a_sequence_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="algorithms is empty; give at least one"):
+    with pytest.raises(ValueError, match=r"algorithms is \(\); give a tuple of at least one"):
         Sequence(())
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_what_is_no_algorithm_is_refused():
+    task = make_task("rope_folding", 5)
+    for wrong in (CEM, "cem", 3, Sequence):
+        with pytest.raises(ValueError, match=r"is no algorithm; give CEM\(\) or another"):
+            optimize(make_problem(task, np.array([0])), wrong, jax.random.key(0))
+        with pytest.raises(ValueError, match=r"is no algorithm; give CEM\(\) or another"):
+            Sequence((CEM(), wrong))
+    assert hash(Sequence([CEM(), Descent()])) == hash(Sequence((CEM(), Descent())))
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("key", [0, None, np.zeros(2), jax.random.split(jax.random.key(0))])
+def test_what_is_no_key_is_refused(key):
+    problem = make_problem(make_task("rope_folding", 5), np.array([0]))
+    with pytest.raises(ValueError, match=r"^key is .*; give one key, as made by jax.random.key"):
+        optimize(problem, CEM(), key)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize("batch", [0, 2.5])
+def test_a_batch_of_nothing_is_refused(batch):
+    problem = make_problem(make_task("rope_folding", 5), np.array([0]))
+    with pytest.raises(ValueError, match=f"batch is {batch}; give a whole number of at least 1"):
+        optimize(problem, CEM(), jax.random.key(0), batch=batch)
 
 
 # --- one code, two drivers ------------------------------------------------------------------------

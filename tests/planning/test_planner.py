@@ -29,7 +29,7 @@ from jaxsimp.planning import (
     problem,
 )
 from jaxsimp.records import load_plan, save_plan
-from jaxsimp.tasks import make_task, score
+from jaxsimp.tasks import Episode, make_task, score
 
 ALGORITHM = CEM(num_iterations=2, population=6, initial_populations=1)
 SEQUENCE = Sequence((ALGORITHM, Descent(num_asks=2, num_starts=2), Reranking(num_starts=2)))
@@ -317,3 +317,65 @@ def test_a_plan_of_another_length_is_refused():
     plan = Actions(jnp.zeros((3, 2), int), jnp.zeros((3, 2, 3)))
     with pytest.raises(ValueError, match=r"has \(3, 2\) actions and pickers.*takes \(2, 2\); give"):
         Planner(task).execute(task.episode_fn(0), plan)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_what_is_not_of_the_task_is_refused_at_the_door():
+    task = dataclasses.replace(make_task("rope_folding", 5), num_actions=1)
+    made, episode = Planner(task), task.episode_fn(0)
+    far = Actions(np.array([[[0, 5]]]), np.zeros((1, 1, 2, 3)))
+    with pytest.raises(ValueError, match=r"pick\[0, 0, 1\] is 5; a body of 5 particles"):
+        made.costs(episode, far)
+    with pytest.raises(ValueError, match=r"pick\[0, 1\] is 5; a body of 5 particles"):
+        made.execute(episode, jax.tree.map(lambda leaf: leaf[0], far))
+    with pytest.raises(ValueError, match=r"give shapes \(B, T, G\) and \(B, T, G, 3\)"):
+        made.costs(episode, jax.tree.map(lambda leaf: leaf[0], far))
+    with pytest.raises(ValueError, match="there are no plans; give at least one"):
+        made.costs(episode, Actions(np.zeros((0, 1, 2), int), np.zeros((0, 1, 2, 3))))
+    with pytest.raises(ValueError, match=r"has \(2, 2\) actions and pickers.*takes \(1, 2\)"):
+        made.costs(episode, Actions(np.zeros((1, 2, 2), int), np.zeros((1, 2, 2, 3))))
+    idle = Actions(np.full((1, 2), NONE), np.zeros((1, 2, 3)))
+    start = np.array(episode.start)
+    start[3, 1] = np.nan
+    for wrong, message in (
+        (Episode(start, episode.goal), r"start of the episode\[3, 1\] is nan; give numbers"),
+        (Episode(episode.start, start[:4]), r"goal of the episode has shape \(4, 3\).*\(5, 3\)"),
+        (episode.start, r"the episode is a ndarray; give Episode\(start, goal\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            made.plan(wrong, [0])
+        with pytest.raises(ValueError, match=message):
+            made.costs(wrong, jax.tree.map(lambda leaf: leaf[None], idle))
+        with pytest.raises(ValueError, match=message):
+            made.execute(wrong, idle)
+        with pytest.raises(ValueError, match=message):
+            make_problem(task, [0], wrong)
+    for seed in (-1, 0.5, 2**32, True):
+        with pytest.raises(ValueError, match=f"seed is {seed}; give a whole number from 0 to"):
+            made.plan(episode, [0], seed=seed)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"engine": "mjx"}, "engine is 'mjx'; give an engine"),
+        ({"engine": MassSprings}, "engine is <class .*; give an engine"),
+        ({"evaluator": 3}, "evaluator is 3; give an engine"),
+        ({"layout": 8}, r"layout is 8; give Layout\("),
+    ],
+)
+def test_what_is_no_engine_or_layout_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        Planner(make_task("rope_folding", 5), **given)
+
+
+def test_a_callback_that_raises_leaves_the_planner_as_it_was():
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        planner().plan(small_task().episode_fn(3), np.array([0, 4]), CEM(2, 8), 3, stop)
+    again = planner().plan(small_task().episode_fn(3), np.array([0, 4]), CEM(2, 8), 3)
+    alone = Planner(small_task()).plan(small_task().episode_fn(3), np.array([0, 4]), CEM(2, 8), 3)
+    np.testing.assert_array_equal(again.optimum.best_costs, alone.optimum.best_costs)

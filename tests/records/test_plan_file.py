@@ -16,7 +16,7 @@ from jaxsimp import goals
 from jaxsimp.bodies import t_shirt
 from jaxsimp.dynamics import Actions, Box, Capsule, Sphere, Table
 from jaxsimp.engines import Execution, ExecutionStatus, MassSprings
-from jaxsimp.records import SavedPlan, load_plan, save_plan
+from jaxsimp.records import SavedPlan, load_plan, plan_file, save_plan
 from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, score
 
 
@@ -201,7 +201,7 @@ def test_a_save_that_fails_leaves_the_old_plan(tmp_path, monkeypatch):
         with pytest.raises(OSError, match="no space"):
             write(tmp_path / name)
     assert path.read_bytes() == before
-    assert not (tmp_path / "new.npz").exists()
+    assert [each.name for each in tmp_path.iterdir()] == ["plan.npz"]
 
 
 def broken_files() -> dict[str, bytes]:
@@ -246,3 +246,81 @@ def test_a_damaged_description_is_refused_by_name(tmp_path, about):
 def test_a_plan_that_is_not_there(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"plan\.npz"):
         load_plan(tmp_path / "plan.npz")
+
+
+def rewritten(path: Path, **changed) -> Path:
+    """The file with other arrays; None leaves one out."""
+    write(path)
+    arrays = dict(np.load(path)) | changed
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    return path
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"pick": np.array([[0, 9]])}, r"pick\[0, 1\] is 9; a body of 9 particles"),
+        ({"pick": np.array([[2**40, 0]])}, rf"pick\[0, 0\] is {2**40}; a body of 9"),
+        ({"pick": np.array([[0.5, 0.0]])}, "pick is an array of float64"),
+        ({"displacement": np.zeros((1, 1, 3))}, r"give shapes \(T, G\)"),
+        ({"displacement": np.full((1, 2, 3), np.nan)}, "is nan; give numbers"),
+        ({"positions": np.zeros((2, 9, 3))}, r"shape \(2, 9, 3\); \(3, 9, 3\) is needed"),
+        ({"positions": np.zeros(3)}, r"a body of 0 particles|shape \(3,\)"),
+        ({"start": np.zeros((8, 3))}, r"start of the episode has shape \(8, 3\)"),
+        ({"start": None}, "KeyError: has no 'start'"),
+        ({"body/mass": np.zeros(3)}, "mass has shape"),
+        ({"about": "[1, 2]"}, "about is no description"),
+        ({"about": json.dumps({"body": []})}, "about is no description"),
+        ({"about": "[" * 100_000}, "RecursionError"),
+    ],
+)
+def test_arrays_that_are_no_plan_are_refused_by_name(tmp_path, changed, message):
+    path = rewritten(tmp_path / "plan.npz", **changed)
+    with pytest.raises(ValueError, match=rf"plan\.npz is damaged .*({message})"):
+        load_plan(path)
+
+
+def test_a_file_of_pickles_is_refused_and_nothing_of_it_runs(tmp_path):
+    class Evil:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "ran",))
+
+    path = tmp_path / "plan.npz"
+    np.savez(path, pick=np.array([Evil()]), displacement=np.zeros(1), positions=np.zeros(1))
+    with pytest.raises(ValueError, match=r"plan\.npz cannot be read \(.*pickle.*not a saved plan"):
+        load_plan(path)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_file_that_unpacks_to_more_than_memory_is_refused_before_it_is(tmp_path, monkeypatch):
+    path = tmp_path / "plan.npz"
+    write(path)
+    monkeypatch.setattr(plan_file, "MOST_BYTES", 1000)
+    with pytest.raises(ValueError, match=r"it unpacks to [\d,]+ bytes, and 1,000 are allowed"):
+        load_plan(path)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_what_is_no_plan_of_the_task_is_not_saved(tmp_path):
+    task, episode = rope_task(), rope_task().episode_fn(0)
+    other = Episode(episode.start[:4], episode.goal)
+    long = Execution(np.zeros((5, 9, 3)), 0.5)
+    far = Actions(np.array([[0, 9]]), PLAN.displacement)
+    for arguments, message in (
+        ((episode, far, executed()), "is 9; a body of 9"),
+        ((other, PLAN, executed()), r"start of the episode has shape \(4, 3\)"),
+        ((episode, PLAN, long), r"shape \(5, 9, 3\); \(3, 9, 3\) is needed"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_plan(str(tmp_path / "plan.npz"), task, *arguments, engine="mine")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_task_is_told(tmp_path):
+    write(tmp_path / "plan.npz")
+    about = json.loads(str(np.load(tmp_path / "plan.npz")["about"]))
+    del about["task"]["limits"]
+    path = rewritten(tmp_path / "plan.npz", about=json.dumps(about))
+    with pytest.raises(ValueError, match=r"of the task is damaged \(KeyError: 'limits'"):
+        load_plan(path).task()

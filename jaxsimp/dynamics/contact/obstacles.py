@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.material import FAMILIES
 from jaxsimp.bodies.meshes import covering_radii
+from jaxsimp.checks import as_reals
 
 Values = Float[Array | np.ndarray, "..."] | float
 """One number for each point."""
@@ -31,6 +32,8 @@ SHAPES_OF_NUMBERS: dict[Any, tuple[int, ...]] = {Number: (), Vector: (3,)}
 
 STRETCH = FAMILIES.index("stretch_stiffness")
 """The family of springs that are a rope's links."""
+FARTHEST, SHORTEST = 1e6, 1e-6
+"""Largest number of an obstacle, and least length of a normal or an axis: float32 squares them."""
 UP = (0.0, 0.0, 1.0)
 """The constant normal of the table: contact along it is arithmetic of heights alone."""
 LEAST_SIZE = 2.0
@@ -87,8 +90,11 @@ class Plane:
 
     def size(self) -> tuple[str, float]:
         """See `Obstacle`."""
-        if not np.linalg.norm(self.normal) > 0:
-            raise ValueError(f"normal is {_told(self.normal)}; give a direction of any length")
+        if not np.linalg.norm(self.normal) >= SHORTEST:
+            raise ValueError(
+                f"normal is {_told(self.normal)}; give a direction of a length of {SHORTEST:g} to "
+                f"{FARTHEST:g}"
+            )
         return "", np.inf
 
 
@@ -138,7 +144,7 @@ class Capsule:
 
     def size(self) -> tuple[str, float]:
         """See `Obstacle`."""
-        if np.array_equal(self.start, self.end):
+        if not np.linalg.norm(np.subtract(self.end, self.start)) >= SHORTEST:
             raise ValueError(f"start and end are both {_told(self.end)}; give a Sphere instead")
         return "radius", _positive("radius", self.radius)
 
@@ -250,6 +256,8 @@ def check_obstacles(obstacles: Sequence[Any], body: Body) -> None:
         ValueError: if an entry is no obstacle, a number has another shape, is not finite or out
             of its range, or an obstacle is smaller than `least_radius` of the body.
     """
+    if not isinstance(obstacles, Sequence):
+        raise ValueError(f"obstacles is {obstacles!r}; give a tuple of them, as (Table(),)")
     for obstacle in obstacles:
         if isinstance(obstacle, type) or not isinstance(obstacle, Obstacle):
             raise ValueError(
@@ -292,17 +300,19 @@ def _numbers(obstacle: Any) -> dict[str, np.ndarray]:
     """An obstacle's numbers by field.
 
     Raises:
-        ValueError: if one has another shape or is not finite.
+        ValueError: if one has another shape, is not finite or beyond `FARTHEST`.
     """
     numbers = {}
     for field in dataclasses.fields(obstacle):
-        value = np.asarray(getattr(obstacle, field.name), dtype=float)
-        shape = SHAPES_OF_NUMBERS.get(field.type, value.shape)
-        if value.shape != shape or not np.isfinite(value).all():
+        given = getattr(obstacle, field.name)
+        value = as_reals(given)
+        shape = SHAPES_OF_NUMBERS.get(field.type, np.shape(given))
+        if value is None or value.shape != shape or not np.all(np.abs(value) <= FARTHEST):
             wanted = {(): "a finite number", (3,): "three finite numbers"}.get(
                 shape, "finite numbers"
             )
-            raise ValueError(f"{field.name} is {_told(value)}; give {wanted}")
+            told = repr(given) if value is None else _told(value)
+            raise ValueError(f"{field.name} is {told}; give {wanted} up to {FARTHEST:g}")
         numbers[field.name] = value
     return numbers
 

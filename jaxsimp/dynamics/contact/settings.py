@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import covering_radii
 from jaxsimp.bodies.topology import half_edges, neighbours
+from jaxsimp.checks import require_number
 
 TOP_SPEED = 2.1
 """Default of the fastest that pickers may move, metres per second."""
@@ -134,8 +135,8 @@ def make_self_contact(
             "thickness is 0; self-contact holds layers that far apart: give metres above zero"
         )
     friction = body.material.friction if friction is None else friction
-    if not 0 <= friction < np.inf:
-        raise ValueError(f"friction is {friction}; give a finite number, zero or more")
+    require_number("friction", friction, 0.0, 1e3)
+    require_number("top_speed", top_speed, 0.0, 1e6, "m/s")
     is_sheet = len(body.faces) > 0
     layers = MOST_LAYERS_OF_SHEETS if is_sheet else MOST_LAYERS_OF_ROPES
     fastest = layers * thickness / time_step

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsimp.bodies import Body
+from jaxsimp.checks import require_count
 from jaxsimp.dynamics import (
     NONE,
     Actions,
@@ -56,8 +57,10 @@ def compare_with_mjx(
         gravity: downward acceleration, metres per second squared.
 
     Raises:
-        ValueError: if the body reaches the table, or `make_mjx_simulation` raises.
+        ValueError: if the body reaches the table, `num_steps` is no whole number above zero, or
+            `make_mjx_simulation` raises.
     """
+    num_steps = require_count("num_steps", num_steps, 1)
     ours = make_simulation(body, time_step, gravity)
     theirs = make_mjx_simulation(body, time_step, gravity)
     lowest, found = jax.jit(_compare, static_argnames="num_steps")(ours, theirs, state, num_steps)

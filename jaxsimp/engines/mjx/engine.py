@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxsimp.bodies import Body
+from jaxsimp.checks import require_count
 from jaxsimp.dynamics import (
     Actions,
     Obstacle,
@@ -29,7 +30,7 @@ from jaxsimp.dynamics import (
     make_simulation,
 )
 from jaxsimp.dynamics.contact.rigid import contact
-from jaxsimp.dynamics.pickers import grasp, speed_profile
+from jaxsimp.dynamics.pickers import grasp, require_actions, speed_profile
 from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.mjx.tendons import tendon_spec
 from jaxsimp.engines.rollouts import RolloutExecutor
@@ -125,7 +126,11 @@ def mjx_trajectory(
     Returns:
         States after each of `num_steps` steps, and the accelerations in those steps, stacked along
         a first axis.
+
+    Raises:
+        ValueError: if `num_steps` is no whole number.
     """
+    num_steps = require_count("num_steps", num_steps, 0)
 
     def one(state: State, _: None) -> tuple[State, tuple[State, Float[Array, "N 3"]]]:
         state, acceleration = _free_step(simulation, state)
@@ -141,7 +146,12 @@ def mjx_rollout(
     actions: Actions,
     observe: Observe = lambda state, action: state.position,
 ) -> tuple[State, PyTree[Any]]:
-    """Carry out a plan in MJX; arguments and result are those of `SearchEngine.rollout`."""
+    """Carry out a plan in MJX; arguments and result are those of `SearchEngine.rollout`.
+
+    Raises:
+        ValueError: if `jaxsimp.dynamics.pickers.require_actions` refuses the plan.
+    """
+    actions = require_actions(actions, len(simulation.ours.mass))
 
     def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:
         ours = simulation.ours

@@ -3,6 +3,8 @@
 from typing import Any
 
 from jaxsimp.bodies import Body
+from jaxsimp.checks import require_number
+from jaxsimp.dynamics.simulation import MOST_GRAVITY
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -26,8 +28,14 @@ def tendon_spec(body: Body, time_step: float = 2e-3, gravity: float = 9.81) -> A
         body: body to simulate.
         time_step: time step, seconds.
         gravity: downward acceleration, metres per second squared.
+
+    Raises:
+        ValueError: if a number is out of its range.
     """
     import mujoco
+
+    require_number("time_step", time_step, 1e-9, 1e3, "s")
+    require_number("gravity", gravity, -MOST_GRAVITY, MOST_GRAVITY, "m/s^2, downward")
 
     spec = mujoco.MjSpec()
     spec.modelname = body.name

@@ -17,12 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsimp.checks import require_count
 from jaxsimp.dynamics import NONE, Actions, Pickers, Simulation, make_pickers
-from jaxsimp.dynamics.pickers import grasp, speed_profile
+from jaxsimp.dynamics.pickers import grasp, require_actions, speed_profile
 from jaxsimp.engines.engine import Execution, ExecutionStatus, Executor
 from jaxsimp.engines.mujoco.model import Variant, as_variant, make_model
+from jaxsimp.engines.population import MOST_WORKERS
 from jaxsimp.machine import num_cores
 from jaxsimp.tasks import Episode, Task, score
+from jaxsimp.tasks.episode import require_episode
 
 LEAD = 4
 """Lead of the mocap body, in time steps. A mocap body has no velocity, so the constraint brakes the
@@ -82,13 +85,18 @@ def replay(
             depend on it.
 
     Raises:
-        ValueError: if the numbers of episodes and plans differ, a plan names a particle that the
-            body does not have, or the variant is unknown.
+        ValueError: if the numbers of episodes and plans differ, one of them is not of the body,
+            `num_workers` is no number of workers, or the variant is unknown.
     """
     if len(episodes) != len(plans):
         raise ValueError(
             f"{len(episodes)} episodes are given for {len(plans)} plans; give one for each"
         )
+    if num_workers is not None:
+        require_count("num_workers", num_workers, 1, MOST_WORKERS)
+    for episode in episodes:
+        require_episode(episode, task.body.num_particles)
+    plans = [require_actions(plan, task.body.num_particles) for plan in plans]
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
     model = make_model(task.body, variant, picked, obstacles=task.obstacles)
     one = partial(_replay_one, task, task.simulation(), model, jax.jit(partial(score, task)))

@@ -27,6 +27,7 @@ from jaxtyping import Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import face_areas
 from jaxsimp.bodies.topology import are_among, chain, half_edges
+from jaxsimp.checks import require_choice, require_number
 from jaxsimp.dynamics import Obstacle, Table, largest_time_step
 from jaxsimp.dynamics.contact.obstacles import make_obstacles
 from jaxsimp.engines.mujoco.geoms import obstacle_geoms
@@ -55,8 +56,7 @@ class Variant:
     self_collision: bool
 
     def __post_init__(self) -> None:
-        if not 0 < self.time_step < float("inf"):
-            raise ValueError(f"time_step is {self.time_step}; give seconds above zero")
+        require_number("time_step", self.time_step, 1e-6, 1.0, "s")
 
 
 VARIANTS = {
@@ -73,8 +73,7 @@ def as_variant(variant: str | Variant) -> Variant:
     """
     if isinstance(variant, Variant):
         return variant
-    if variant not in VARIANTS:
-        raise ValueError(f"variant is {variant!r}; choose one of {', '.join(VARIANTS)}")
+    require_choice("variant", variant, VARIANTS)
     return VARIANTS[variant]
 
 
@@ -127,8 +126,9 @@ def make_model(
         obstacles: rigid bodies at rest; a rounded box becomes boxes and capsules.
 
     Raises:
-        ValueError: if the variant or a particle does not exist, or an obstacle is refused, see
-            `jaxsimp.dynamics.make_simulation`.
+        ValueError: if the variant or a particle does not exist; if an obstacle is refused, see
+            `jaxsimp.dynamics.make_simulation`; or if the body has no segment, no thickness, or is
+            to be elastic and has no stiffness.
     """
     return _spec(body, as_variant(variant), graspable, obstacles).compile()
 
@@ -168,6 +168,7 @@ def _spec(
     """The uncompiled model of a body."""
     import mujoco
 
+    _check_body(body, variant)
     spec = mujoco.MjSpec()
     spec.modelname = body.name
     _set_options(spec, body, variant)
@@ -198,6 +199,24 @@ def _spec(
     for particle in sorted(set(map(int, graspable))):
         _add_picker(spec, body, particle)
     return spec
+
+
+def _check_body(body: Body, variant: Variant) -> None:
+    """Raise a `ValueError` if MuJoCo has no flexible body like this."""
+    if body.num_particles < 2 or not len(body.springs):
+        raise ValueError(
+            f"this {body.name} has {body.num_particles} particles and {len(body.springs)} springs; "
+            f"a flexible body of MuJoCo takes at least 2 particles, joined by a spring"
+        )
+    if not body.radius > 0:
+        raise ValueError(
+            f"the thickness of this {body.name} is 0; MuJoCo's contact takes metres above zero"
+        )
+    if variant.elastic and not body.stiffness.any():
+        raise ValueError(
+            f"all springs of this {body.name} have stiffness 0; an elastic model of MuJoCo takes "
+            f"newtons per metre above zero. Give some, or the variant fast, which hardly stretches"
+        )
 
 
 def _set_options(spec: Any, body: Body, variant: Variant) -> None:
@@ -251,12 +270,17 @@ def _set_elements(flex: Any, body: Body, variant: Variant) -> None:
 
 
 def _set_sheet(flex: Any, body: Body) -> None:
-    """Set the elasticity of a sheet: one thickness gives both stretch and bending stiffness."""
-    stretch = stretch_stiffness(body, body.stiffness)
-    thickness = np.sqrt(12 * (1 - POISSON**2) * bending_rigidity(body) / stretch)
+    """Set the elasticity of a sheet: one thickness gives both stretch and bending stiffness.
+
+    A sheet that does not resist bending has that of the body, and no bending of MuJoCo's.
+    """
+    stretch, bending = stretch_stiffness(body, body.stiffness), bending_rigidity(body)
+    thickness = np.sqrt(12 * (1 - POISSON**2) * bending / stretch)
+    if not bending:
+        thickness = body.material.thickness
     flex.young, flex.poisson, flex.thickness = stretch / thickness, POISSON, thickness
     flex.damping = stretch_stiffness(body, body.damping) / stretch
-    flex.elastic2d = 3  # both stretching and bending
+    flex.elastic2d = 3 if bending else 2  # both stretching and bending, or stretching alone
 
 
 def _set_rope(flex: Any, body: Body) -> None:
