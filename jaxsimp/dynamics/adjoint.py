@@ -26,9 +26,13 @@ from jaxsimp.dynamics.contact.stepping import (
     touch_step,
     touch_step_vjp,
 )
-from jaxsimp.dynamics.modes import constant, forward_only, reverse_only
 from jaxsimp.dynamics.simulation import Simulation
 from jaxsimp.dynamics.step import Axes, Motion, Packed, step_and_free, step_vjp
+
+try:
+    from jaxsimp.dynamics.modes import constant, forward_only, reverse_only
+except (ImportError, AttributeError):  # of a JAX that is made otherwise: its own words must do
+    constant = forward_only = reverse_only = lambda tree: tree
 
 
 def plain_steps(
