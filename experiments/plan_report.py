@@ -119,8 +119,9 @@ def _report(study: PlanStudy, summary: dict[str, Any], transfer: Rows) -> str:
     lines = [
         f"# Goal-conditioned model simplification: the study {study.name!r}",
         "",
-        f"A plan succeeds when its settled score is at least {study.success_score}. Score 1 is "
-        f"the goal, 0 the start; the body {_touching(study)}. "
+        f"A plan succeeds when its settled score is at least {study.success_score}. Score 1 is a "
+        f"cost of 0, which a goal need not have, and 0 is the start; the body "
+        f"{_touching(study)}. "
         f"{study.seeds} seeds a row; intervals are 95 % "
         "(Wilson for rates, Student's t in the figures).",
         "",
@@ -148,7 +149,16 @@ def _report(study: PlanStudy, summary: dict[str, Any], transfer: Rows) -> str:
 
 def _model_table(models: list[dict[str, Any]]) -> list[str]:
     return table(
-        ["task", "key points", "particles", "model error (mm)", "threshold (mm)", "method"],
+        [
+            "task",
+            "key points",
+            "particles",
+            "model error (mm)",
+            "threshold (mm)",
+            "method",
+            "score of the goal",
+            "of the goal let go and settled",
+        ],
         (
             [
                 m["task"],
@@ -157,10 +167,15 @@ def _model_table(models: list[dict[str, Any]]) -> list[str]:
                 f"{1e3 * _error(m):.2f}",
                 f"{1e3 * m['threshold']:.1f}",
                 m["method"],
+                *(_cell(m[name]) for name in ("goal_score", "goal_settled_score")),
             ]
             for m in models
         ),
     )
+
+
+def _cell(score: float | None) -> str:
+    return "unstable" if score is None else f"{score:.3f}"
 
 
 def _error(model: dict[str, Any]) -> float:

@@ -20,7 +20,7 @@ from rich.console import Console
 from experiments.progress import progress_bar
 from experiments.study import teller
 from jaxsimp import records
-from jaxsimp.engines import MassSprings, SearchEngine, Spread, make_ensemble
+from jaxsimp.engines import MassSprings, SearchEngine, Spread, goal_scores, make_ensemble
 from jaxsimp.planning import CEM, ENCODINGS, Planner
 from jaxsimp.simplification import METHODS, KeyPoints, simplify
 from jaxsimp.tasks import Task, make_task, task_names
@@ -278,7 +278,7 @@ def run_study(
         _run_all(study, models, left, folder, environment, console)
     return {
         "environment": environment,
-        "models": [_model_row(name, model) for name, model in models.items()],
+        "models": [_model_row(study, name, model) for name, model in models.items()],
         "runs": rows.in_order(runs),
     }
 
@@ -405,9 +405,14 @@ def key_points(study: PlanStudy, name: str) -> KeyPoints:
     return simplify(task.body, task.goal, method=study.method)
 
 
-def _model_row(task: str, model: KeyPoints) -> dict[str, Any]:
+def _model_row(study: PlanStudy, name: str, model: KeyPoints) -> dict[str, Any]:
+    """The key points of a task's goal, and what the goal itself scores."""
+    task = study.task(name)
+    scores = goal_scores(task, task.episode_fn(0), MassSprings(self_contact=study.self_contact))
     return {
-        "task": task,
+        "task": name,
+        "goal_score": finite(scores.laid),
+        "goal_settled_score": finite(scores.settled),
         "method": model.method,
         "sizes": list(model.sizes),
         "errors": list(model.errors),

@@ -56,6 +56,7 @@ def test_summary_has_its_schema(folder):
     assert [model["task"] for model in summary["models"]] == list(TASKS)
     for model in summary["models"]:
         assert model["method"]
+        assert 0.5 < model["goal_settled_score"] <= model["goal_score"] <= 1
         assert len(model["sizes"]) == len(model["errors"]) > 0
         # The first size that fits is the one chosen; others are there to be shown.
         fits = [error < model["threshold"] for error in model["errors"]]
