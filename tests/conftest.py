@@ -20,8 +20,8 @@ matplotlib.use("Agg")
 
 # Most of the time of a test goes into compilation. Little optimisation and XLA's older emitters
 # make of the same operations other machine code in less than half of it; what it gives differs by
-# rounding. `JAXSIMP_OPTIMISED=1` leaves XLA as users have it, as `.ci/run` does for quick tests of
-# the dynamics. A flag that an XLA does not know ends the process.
+# rounding. `JAXSIMP_OPTIMISED=1` leaves XLA as users have it, as `.ci/run` does for tests of layers
+# that touch. A flag that an XLA does not know ends the process.
 QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 if not os.environ.get("JAXSIMP_OPTIMISED"):
     jax.config.update("jax_disable_most_optimizations", True)

@@ -757,6 +757,7 @@ def test_the_adjoint_is_the_derivative_that_jax_takes(path):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("once")
 def test_memory_of_a_gradient_grows_with_the_square_root_of_the_steps():
     simulation, _, start, actions = fold_by_hand(5)

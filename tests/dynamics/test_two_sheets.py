@@ -147,6 +147,7 @@ def test_four_layers_of_a_folded_t_shirt_lie_in_order():
     check_fold(shirt(6000), least=0.98)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_gradients_through_contact_of_two_sheets_equal_differences():
     """By displacements of pickers, and by the start, in the air.
