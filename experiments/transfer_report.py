@@ -97,7 +97,7 @@ def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) 
         f"A plan transfers when its settled score is at least {study.success_score}. Score 1 is a "
         f"cost of 0, which a goal need not have, and 0 is the start. {study.plans.seeds} seeds a "
         "row; intervals are 95 % (Wilson). Fast: hardly stretches, limp, layers pass through "
-        "others. Full: elastic as our springs are, with self-collision and friction between layers.",
+        "others. Full: elastic as our springs are, with self-collision and friction of layers.",
         "",
         "## Plans found by the search",
         *_table(summary["transfer"], study.success_score),
