@@ -104,7 +104,7 @@ class RolloutExecutor:
         Raises:
             ValueError: if the episode or the plan is not of the task.
         """
-        require_episode(episode, self._task.body.num_particles)
+        episode = require_episode(episode, self._task.body.num_particles)
         actions = require_plan(self._task, actions)
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
         shared = (self._physics, as_float(episode))

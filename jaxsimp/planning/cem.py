@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from jaxsimp.checks import require_choice, require_count, require_number
+from jaxsimp.checks import require_choice, require_count, require_flag, require_number
 from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.encodings import Categorical, Encoding
@@ -81,6 +81,7 @@ class CEM(Defaults):
         require_number("elite_fraction", self.elite_fraction, 1e-6, 1.0)
         require_number("smoothing", self.smoothing, 0.0, 0.999)
         require_number("initial_spread", self.initial_spread, 1e-6, 1e3, "limits")
+        require_flag("keep_best", self.keep_best)
         require_choice("returns", self.returns, ("best", "mean"))
         if isinstance(self.encoding, type) or not isinstance(self.encoding, Encoding):
             raise ValueError(

@@ -245,7 +245,7 @@ def test_a_running_cost_sees_an_action_of_all_pickers():
             lambda key: Episode(*np.random.default_rng(int(key)).uniform(size=(2, 9, 3))),
             r"asks for the values of arrays",
         ),
-        (lambda: None, r"fails with TypeError: .*; it must accept a key"),
+        (lambda: None, r"fails with TypeError: .*; let it take a key"),
     ],
 )
 def test_what_draws_no_episode_by_a_key_is_refused(draw_fn, said):
