@@ -77,16 +77,23 @@ def make_pickers(
     Raises:
         ValueError: if a number is out of its range.
     """
-    require_limits(limits)
+    limits = require_limits(limits)
     require_number("max_stretch", max_stretch, LEAST_STRETCH, MOST_STRETCH)
     steps = require_count("steps", steps, 1, MOST_STEPS)
     return Pickers(jnp.asarray(limits, dtype=float), jnp.asarray(max_stretch, dtype=float), steps)
 
 
-def require_limits(limits: Any) -> None:
-    """Raise a `ValueError` unless limits are three displacements above zero, metres."""
-    if require_numbers("limits", limits, LEAST_LIMIT, MOST_LIMIT, "m").shape != (3,):
+def require_limits(limits: Any) -> tuple[float, float, float]:
+    """Three displacements above zero, metres, as floats.
+
+    Raises:
+        ValueError: if there are other than three, or one is out of its range.
+    """
+    array = require_numbers("limits", limits, LEAST_LIMIT, MOST_LIMIT, "m")
+    if array.shape != (3,):
         raise ValueError(f"limits is {limits}; give three displacements in metres, along x, y, z")
+    x, y, z = array.tolist()
+    return x, y, z
 
 
 def require_actions(actions: Any, num_particles: int, *, batch: bool = False) -> Actions:

@@ -73,7 +73,8 @@ def require_plan(task: Task, actions: Actions, *, batch: bool = False) -> Action
         )
     if not actions.pick.size:
         raise ValueError("there are no plans; give at least one")
-    return actions
+    # Of these types are the plans that evaluations are compiled for.
+    return Actions(jnp.asarray(actions.pick, int), jnp.asarray(actions.displacement, float))
 
 
 class RolloutExecutor:

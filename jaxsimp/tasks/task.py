@@ -91,13 +91,15 @@ class Task:
     def __post_init__(self) -> None:
         check_obstacles(self.obstacles, self.body)
         goals.check_goal(self.body, self.goal, has_table=has_table(self.obstacles))
-        require_limits(self.limits)
+        own: dict[str, object] = {"limits": require_limits(self.limits)}
         if not isinstance(self.name, str):
             raise ValueError(f"name is {self.name!r}; give a text")
         for name, counts in COUNTS.items():
-            require_count(name, getattr(self, name), *counts)
+            own[name] = require_count(name, getattr(self, name), *counts)
         for name, seconds in SECONDS.items():
-            require_number(name, getattr(self, name), *seconds, "s")
+            own[name] = require_number(name, getattr(self, name), *seconds, "s")
+        for name, plain in own.items():  # plan files hold plain numbers
+            object.__setattr__(self, name, plain)
         check_costs(
             self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
         )

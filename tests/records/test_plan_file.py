@@ -96,7 +96,9 @@ def test_an_obstacle_of_another_shape_is_not_read(tmp_path):
     task = dataclasses.replace(rope_task(), obstacles=(Ball((0.0, 0.0, 0.0), 0.1),))
     path = tmp_path / "plan.npz"
     save_plan(path, task, task.episode_fn(0), PLAN, executed(), engine=MassSprings())
-    with pytest.raises(ValueError, match=r"obstacle of the shape Ball; files are read with Table"):
+    with pytest.raises(
+        ValueError, match=r"obstacle of the shape 'Ball'; files are read with Table"
+    ):
         load_plan(path).task()
 
 
