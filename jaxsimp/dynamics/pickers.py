@@ -11,18 +11,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsimp.checks import require_count, require_number, require_numbers
+from jaxsimp.dynamics.arrays import as_array, require_known
 from jaxsimp.dynamics.contact.obstacles import Obstacle, Table
 
 NONE = -1
 """The particle id of a picker that grasps nothing (None in Eq. 1 of the paper)."""
+IDS = f"ids of particles, as integers, and {NONE} for a picker that grasps nothing"
+"""What to give for `Actions.pick`."""
 GRAZE = 1e-5
 """Depth, metres, to which a path may enter an obstacle: paths along a surface have rounding."""
 LEAST_LIMIT, MOST_LIMIT = 1e-6, 1e3
 """Range of the largest displacement of an action, metres."""
 LEAST_STRETCH, MOST_STRETCH = 1.0001, 1e6
 """Range of `Pickers.max_stretch`; the largest is none."""
-FARTHEST = 1e6
-"""Largest coordinate of a displacement or a position, metres; limits end displacements earlier."""
 MOST_STEPS = 10_000_000
 """Most time steps of an action."""
 TOUCHES = 16
@@ -76,16 +77,23 @@ def make_pickers(
     Raises:
         ValueError: if a number is out of its range.
     """
-    require_limits(limits)
+    limits = require_limits(limits)
     require_number("max_stretch", max_stretch, LEAST_STRETCH, MOST_STRETCH)
     steps = require_count("steps", steps, 1, MOST_STEPS)
     return Pickers(jnp.asarray(limits, dtype=float), jnp.asarray(max_stretch, dtype=float), steps)
 
 
-def require_limits(limits: Any) -> None:
-    """Raise a `ValueError` unless limits are three displacements above zero, metres."""
-    if require_numbers("limits", limits, LEAST_LIMIT, MOST_LIMIT, "m").shape != (3,):
+def require_limits(limits: Any) -> tuple[float, float, float]:
+    """Three displacements above zero, metres, as floats.
+
+    Raises:
+        ValueError: if there are other than three, or one is out of its range.
+    """
+    array = require_numbers("limits", limits, LEAST_LIMIT, MOST_LIMIT, "m")
+    if array.shape != (3,):
         raise ValueError(f"limits is {limits}; give three displacements in metres, along x, y, z")
+    x, y, z = array.tolist()
+    return x, y, z
 
 
 def require_actions(actions: Any, num_particles: int, *, batch: bool = False) -> Actions:
@@ -113,7 +121,7 @@ def checked_actions(
     pick: Any, displacement: Any, num_particles: int, *, batch: bool = False
 ) -> Actions:
     """`require_actions`, of the two arrays of a plan."""
-    pick, displacement = map(_as_known, (pick, displacement))
+    pick, displacement = as_array("pick", pick, IDS), as_array("displacement", displacement)
     if pick.ndim != 2 + batch or 0 in pick.shape[-1:] or displacement.shape != (*pick.shape, 3):
         wanted = "B, T, G" if batch else "T, G"
         raise ValueError(
@@ -121,22 +129,13 @@ def checked_actions(
             f"{displacement.shape}; give shapes ({wanted}) and ({wanted}, 3)"
         )
     _require_ids(pick, num_particles)
-    require_metres("displacement", displacement)
+    require_known("displacement", displacement)
     return Actions(jnp.asarray(pick), jnp.asarray(displacement))
-
-
-def require_metres(name: str, array: Array | np.ndarray) -> None:
-    """Raise a `ValueError` if an array is known and not of metres, finite and up to `FARTHEST`."""
-    if not isinstance(array, jax.core.Tracer):
-        require_numbers(name, np.asarray(array), -FARTHEST, FARTHEST, "m")
 
 
 def _require_ids(pick: Array | np.ndarray, num_particles: int) -> None:
     if not jnp.issubdtype(pick.dtype, jnp.integer):
-        raise ValueError(
-            f"pick is an array of {pick.dtype}; give ids of particles, as integers, and {NONE} for "
-            f"a picker that grasps nothing"
-        )
+        raise ValueError(f"pick is an array of {pick.dtype}; give {IDS}")
     if isinstance(pick, jax.core.Tracer):
         return
     ids = np.asarray(pick)
@@ -145,13 +144,8 @@ def _require_ids(pick: Array | np.ndarray, num_particles: int) -> None:
         place = tuple(wrong[0].tolist())
         raise ValueError(
             f"pick{list(place)} is {ids[place]}; a body of {num_particles} particles has ids 0 to "
-            f"{num_particles - 1}, and {NONE} grasps nothing"
+            f"{num_particles - 1}, and {NONE} grasps nothing: give one of these"
         )
-
-
-def _as_known(array: Any) -> Array | np.ndarray:
-    """The array itself, or one of a list."""
-    return array if hasattr(array, "dtype") else np.asarray(array)
 
 
 def speed_profile(steps: int) -> Float[Array, " steps"]:

@@ -15,7 +15,7 @@ from jaxsimp.checks import require_count
 from jaxsimp.dynamics.adjoint import plain_steps, steps
 from jaxsimp.dynamics.contact.stepping import Moving, begin, end
 from jaxsimp.dynamics.pickers import Actions, Pickers, grasp, require_actions, speed_profile
-from jaxsimp.dynamics.simulation import Simulation, State
+from jaxsimp.dynamics.simulation import Simulation, State, require_state
 from jaxsimp.dynamics.step import Motion, unpack
 
 
@@ -45,7 +45,7 @@ def rollout(
         axis of length T; by default the positions, shape (T, N, 3).
 
     Raises:
-        ValueError: if `require_actions` refuses the plan, or the state is of another body.
+        ValueError: if `require_actions` refuses the plan, or `require_state` the state.
     """
     return rollout_observing(
         simulation, pickers, state, actions, lambda state, _: observe(state), adjoint=adjoint
@@ -62,7 +62,7 @@ def rollout_observing(
     adjoint: bool = True,
 ) -> tuple[State, PyTree[Any]]:
     """`rollout`, but `observe` takes the state at the end of each action, and the action."""
-    _require_state(simulation, state)
+    state = require_state(state, len(simulation.mass))
     actions = require_actions(actions, len(simulation.mass))
     run = steps if adjoint else plain_steps
 
@@ -82,9 +82,9 @@ def settle(simulation: Simulation, state: State, num_steps: int) -> State:
     """The state after `num_steps` time steps with nothing held.
 
     Raises:
-        ValueError: if `num_steps` is no whole number, or the state is of another body.
+        ValueError: if `num_steps` is no whole number, or `require_state` refuses the state.
     """
-    _require_state(simulation, state)
+    state = require_state(state, len(simulation.mass))
     num_steps = require_count("num_steps", num_steps, 0)
     moving = begin(simulation, state)
     held = jnp.zeros(len(state.position), dtype=bool)
@@ -92,15 +92,3 @@ def settle(simulation: Simulation, state: State, num_steps: int) -> State:
     share = jnp.zeros(num_steps, dtype=drive.dtype)
     moving = steps(simulation, moving, Motion(held, drive), share)
     return end(simulation, moving)
-
-
-def _require_state(simulation: Simulation, state: State) -> None:
-    """Raise a `ValueError` unless a state is of the simulated body."""
-    wanted = (len(simulation.mass), 3)
-    for name in ("position", "velocity"):
-        found = jnp.shape(getattr(state, name))
-        if found != wanted:
-            raise ValueError(
-                f"the state has {name} of shape {found}; this body of {wanted[0]} particles needs "
-                f"shape {wanted}"
-            )

@@ -1,8 +1,10 @@
 """Simulations: the physics of a body as arrays, with a time step proven stable."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +12,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsimp.bodies import Body
-from jaxsimp.checks import as_reals, require_number
+from jaxsimp.checks import as_reals, require_flag, require_number
+from jaxsimp.dynamics.arrays import as_array, require_known, require_positions
 from jaxsimp.dynamics.contact.obstacles import Obstacle, Table, has_table, make_obstacles
-from jaxsimp.dynamics.contact.settings import TOP_SPEED, SelfContact, make_self_contact
+from jaxsimp.dynamics.contact.settings import (
+    LEAST_SPEED,
+    MOST_SPEED,
+    TOP_SPEED,
+    SelfContact,
+    make_self_contact,
+)
 from jaxsimp.dynamics.springs import Springs, make_springs
 
 PHYSICS = ("mass", "radius", "drag", "friction", "gravity", "time_step", "obstacles")
 """Fields of `Simulation`, besides springs, with a cotangent: velocities depend on them."""
+LEAST_TIME_STEP = 1e-12
+"""Shortest time step, seconds: float32 holds its square."""
 MOST_GRAVITY = 1e3
 """Largest gravity, up or down, metres per second squared."""
 
@@ -104,23 +115,25 @@ def make_simulation(
         top_speed: largest speed of a picker, metres per second; for self-contact only.
 
     Raises:
-        ValueError: if the time step is not positive, or is unstable for the body's stiffness,
-            damping, drag and mass; if gravity or a number of an obstacle is out of its range; if an
-            obstacle is too small for the body's spacing; or if the body has no thickness, or
-            pickers are too fast, for self-contact.
+        ValueError: if the time step is below `LEAST_TIME_STEP`, or is unstable for the body's
+            stiffness, damping, drag and mass; if another number, or one of an obstacle, is out of
+            its range; if an obstacle is too small for the body's spacing; or if the body has no
+            thickness, or pickers are too fast, for self-contact.
     """
     largest = largest_time_step(body)
     given = as_reals(time_step)
     if given is None or given.ndim:
         require_number("time_step", time_step, 0.0, largest, "s")
-    if not 0 < time_step <= largest:
+    if not LEAST_TIME_STEP <= time_step <= largest:
         # Round down, so that the time step in the message is stable.
         raise ValueError(
-            f"time_step is {time_step:.4g} s; this {body.name} is stable from above 0 to "
-            f"{largest * (1 - 5e-4):.4g} s. Take a smaller time step, a lower stiffness or "
-            f"damping, or a larger mass"
+            f"time_step is {time_step:.4g} s; this {body.name} is stable from "
+            f"{LEAST_TIME_STEP:g} to {largest * (1 - 5e-4):.4g} s. Take a smaller time step, a "
+            f"lower stiffness or damping, or a larger mass"
         )
     require_number("gravity", gravity, -MOST_GRAVITY, MOST_GRAVITY, "m/s^2, downward")
+    require_flag("self_contact", self_contact)
+    require_number("top_speed", top_speed, LEAST_SPEED, MOST_SPEED, "m/s")
 
     def array(value: float | np.ndarray) -> Array:
         return jnp.asarray(value, dtype=float)
@@ -142,9 +155,34 @@ def make_simulation(
 
 
 def at_rest(position: Float[Array | np.ndarray, "N 3"]) -> State:
-    """The state with these positions, metres, and no velocity."""
-    array = jnp.asarray(position, dtype=float)
+    """The state with these positions, metres, and no velocity; for a batch `jax.vmap` it.
+
+    Raises:
+        ValueError: if they are no numbers, or have another shape.
+    """
+    array = jnp.asarray(require_positions("position", position), dtype=float)
     return State(array, jnp.zeros_like(array))
+
+
+def require_state(state: Any, num_particles: int) -> State:
+    """A state of a body as arrays, checked; under `jit` and `vmap` its shapes and types alone.
+
+    Raises:
+        ValueError: if it is no `State`, or its positions or velocities are not those of
+            `num_particles` particles, or not finite.
+    """
+    if not isinstance(state, State):
+        raise ValueError(
+            f"the state is a {type(state).__name__}; give at_rest(position), or "
+            f"State(position, velocity)"
+        )
+    arrays = {}
+    for name, unit in (("position", "m"), ("velocity", "m/s")):
+        told = f"the {name} of the state"
+        arrays[name] = require_positions(told, getattr(state, name), num_particles)
+        require_known(f"state.{name}", arrays[name], unit)
+    missed = as_array("the number missed of the state", state.missed)
+    return dataclasses.replace(state, missed=missed, **arrays)
 
 
 def largest_time_step(body: Body) -> float:

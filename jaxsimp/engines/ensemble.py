@@ -88,7 +88,7 @@ class Ensemble:
         require_choice("statistic", self.statistic, ("mean", "worst"))
         require_number("caution", self.caution, 0.0, MOST_CAUTION)
         if self.statistic == "worst" and self.caution:
-            raise ValueError(f"caution is {self.caution}; it goes with the mean, not the worst")
+            raise ValueError(f"caution is {self.caution}; give 0, as it goes with the mean")
 
     def __len__(self) -> int:
         """Number of members, `E`."""
@@ -180,7 +180,9 @@ def make_ensemble(
             `Task.simulation` for self-contact.
     """
     size, seed = require_count("size", size, 1, MOST_MEMBERS), require_seed(seed)
-    spread = spread or Spread()
+    spread = Spread() if spread is None else spread
+    if not isinstance(spread, Spread):
+        raise ValueError(f"spread is {spread!r}; give Spread(...), of factors of at least 1")
     factors = draw_factors(size, seed, spread)
     members = [_scaled_task(task, dict(zip(QUANTITIES, row, strict=True))) for row in factors]
     durations = factors[:, QUANTITIES.index("time_step")]

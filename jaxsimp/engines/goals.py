@@ -43,7 +43,7 @@ def goal_scores(task: Task, episode: Episode, engine: SearchEngine | None = None
     Raises:
         ValueError: if the episode is not of the task's body.
     """
-    require_episode(episode, task.body.num_particles)
+    episode = require_episode(episode, task.body.num_particles)
     settling = engine or MassSprings(self_contact=True)
     shape = (task.settle_actions, task.num_pickers)
     idle = Actions(jnp.full(shape, NONE), jnp.zeros((*shape, 3)))

@@ -73,7 +73,8 @@ def require_plan(task: Task, actions: Actions, *, batch: bool = False) -> Action
         )
     if not actions.pick.size:
         raise ValueError("there are no plans; give at least one")
-    return actions
+    # Of these types are the plans that evaluations are compiled for.
+    return Actions(jnp.asarray(actions.pick, int), jnp.asarray(actions.displacement, float))
 
 
 class RolloutExecutor:
@@ -104,7 +105,7 @@ class RolloutExecutor:
         Raises:
             ValueError: if the episode or the plan is not of the task.
         """
-        require_episode(episode, self._task.body.num_particles)
+        episode = require_episode(episode, self._task.body.num_particles)
         actions = require_plan(self._task, actions)
         one = jax.tree.map(lambda array: jnp.asarray(array)[None], actions)
         shared = (self._physics, as_float(episode))

@@ -5,6 +5,7 @@ from typing import Any
 
 from jaxtyping import Array, Float, PyTree
 
+from jaxsimp.checks import require_flag
 from jaxsimp.dynamics import Actions, Pickers, Simulation, State, rollout_observing
 from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.rollouts import RolloutExecutor
@@ -25,9 +26,15 @@ class MassSprings:
 
     Attributes:
         self_contact: whether the body touches itself, or passes through itself.
+
+    Raises:
+        ValueError: if it is neither true nor false.
     """
 
     self_contact: bool = False
+
+    def __post_init__(self) -> None:
+        require_flag("self_contact", self.self_contact)
 
     def physics(self, task: Task) -> Physics:
         """The task's simulation and pickers."""

@@ -96,6 +96,12 @@ class Algorithm(Protocol):
         ...
 
 
+def keep(settings: Any, **numbers: float) -> None:
+    """Set numbers of frozen settings as plain ones: settings are keys of what is compiled."""
+    for name, number in numbers.items():
+        object.__setattr__(settings, name, number)
+
+
 class Defaults:
     """Defaults of most algorithms: they want costs, and return the best plan."""
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from jaxsimp.checks import require_choice, require_count, require_number
-from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told
+from jaxsimp.checks import require_choice, require_count, require_flag, require_number
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, keep
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.encodings import Categorical, Encoding
 from jaxsimp.planning.space import ActionSpace, Plans
@@ -78,9 +78,15 @@ class CEM(Defaults):
     def __post_init__(self) -> None:
         for name in ("num_iterations", "population", "initial_populations"):
             require_count(name, getattr(self, name), 1, MOST_PLANS)
-        require_number("elite_fraction", self.elite_fraction, 1e-6, 1.0)
-        require_number("smoothing", self.smoothing, 0.0, 0.999)
-        require_number("initial_spread", self.initial_spread, 1e-6, 1e3, "limits")
+        keep(
+            self,
+            elite_fraction=require_number("elite_fraction", self.elite_fraction, 1e-6, 1.0),
+            smoothing=require_number("smoothing", self.smoothing, 0.0, 0.999),
+            initial_spread=require_number(
+                "initial_spread", self.initial_spread, 1e-6, 1e3, "limits"
+            ),
+        )
+        require_flag("keep_best", self.keep_best)
         require_choice("returns", self.returns, ("best", "mean"))
         if isinstance(self.encoding, type) or not isinstance(self.encoding, Encoding):
             raise ValueError(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray, PyTree
 
 from jaxsimp.checks import require_count, require_number
-from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, Wants
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, Wants, keep
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 
@@ -56,7 +56,8 @@ class Descent(Defaults):
     def __post_init__(self) -> None:
         for name in ("num_asks", "num_starts"):
             require_count(name, getattr(self, name), 1, MOST_PLANS)
-        require_number("learning_rate", self.learning_rate, 1e-6, 10.0, "limits")
+        rate = require_number("learning_rate", self.learning_rate, 1e-6, 10.0, "limits")
+        keep(self, learning_rate=rate)
 
     @property
     def num_plans(self) -> int:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from jaxsimp.checks import require_number
+from jaxsimp.planning.algorithm import keep
 from jaxsimp.planning.space import ActionSpace, Plans
 
 
@@ -217,8 +218,8 @@ class Joint(ChoiceAndDirection):
     fresh: float = 0.05
 
     def __post_init__(self) -> None:
-        require_number("borrowed", self.borrowed, 1e-6, 1e6, "elites")
-        require_number("fresh", self.fresh, 0.0, 1.0)
+        borrowed = require_number("borrowed", self.borrowed, 1e-6, 1e6, "elites")
+        keep(self, borrowed=borrowed, fresh=require_number("fresh", self.fresh, 0.0, 1.0))
 
     def init(self, space: ActionSpace, spread: float) -> ChoiceAndGaussian:
         """Every choice equally likely; displacements of mean 0."""

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxsimp.dynamics import Actions
+from jaxsimp.dynamics.arrays import as_array
 from jaxsimp.engines.rollouts import as_float
 from jaxsimp.planning.algorithm import Algorithm, Sequence, Told, Wants
 from jaxsimp.planning.archive import Archive, empty_archive
@@ -68,6 +69,10 @@ def search_on_host(
         key: key of the random draws.
         evaluate: function that evaluates plans; costs may be NumPy arrays.
         on_ask: function called after each question of an algorithm.
+
+    Raises:
+        ValueError: if `evaluate` returns no `Told`, or no number for each plan; numbers that are
+            not finite count as failures.
     """
 
     def run_stage(
@@ -77,7 +82,7 @@ def search_on_host(
         progress = exchanges.begin(space, archive, failed)
         for each in keys:
             progress, plans, actions = exchanges.ask(space, progress, each)
-            told = as_float(evaluate(stage.wants, actions))
+            told = _checked(evaluate(stage.wants, actions), stage.wants, actions)
             progress, recorded = exchanges.absorb(space, progress, plans, told)
             records.append(recorded)
             on_ask()
@@ -86,9 +91,26 @@ def search_on_host(
 
     def cost_of_one(actions: Actions) -> Told:
         one = jax.tree.map(lambda leaf: leaf[None], actions)
-        return Told(jnp.asarray(evaluate("cost", one).costs)[0])
+        return Told(jnp.asarray(_checked(evaluate("cost", one), "cost", one).costs)[0])
 
     return search(algorithm, space, key, run_stage, cost_of_one)
+
+
+def _checked(told: Any, wants: Wants, actions: Actions) -> Told:
+    """Evaluations of plans as floats on the host, with gradients if they are wanted."""
+    if not isinstance(told, Told):
+        raise ValueError(f"evaluate returns a {type(told).__name__}; return Told(costs)")
+    shapes = {"costs": actions.pick.shape[:1]}
+    if wants == "gradient":
+        shapes["gradients"] = actions.displacement.shape
+    found = {name: as_array(f"{name} of evaluate", getattr(told, name)) for name in shapes}
+    for name, wanted in shapes.items():
+        if found[name].shape != wanted:
+            raise ValueError(
+                f"evaluate returns {name} of shape {found[name].shape}; return shape {wanted}, for "
+                f"{len(actions.pick)} plans"
+            )
+    return Told(**as_float(found))
 
 
 def compiled_exchanges(algorithm: Algorithm, space: ActionSpace, archive_size: int) -> Exchanges:

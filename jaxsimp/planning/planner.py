@@ -126,7 +126,7 @@ class Planner:
                 is not an engine in JAX.
         """
         algorithm, seed = algorithm or CEM(), require_seed(seed)
-        require_episode(episode, self.task.body.num_particles)
+        episode = require_episode(episode, self.task.body.num_particles)
         space = action_space(self.task, candidates)
         compile_seconds = self.prepare(algorithm, space)
         bill = _Bill(partial(self._told, as_float(episode)), _largest_population(algorithm))
@@ -170,7 +170,7 @@ class Planner:
         Raises:
             ValueError: if the episode is not of the body, or `require_plan` refuses the plans.
         """
-        require_episode(episode, self.task.body.num_particles)
+        episode = require_episode(episode, self.task.body.num_particles)
         actions = require_plan(self.task, actions, batch=True)
         sizes = [
             size for wants, size in self._maps if wants == "cost" and size >= len(actions.pick)

@@ -117,7 +117,7 @@ def make_problem(
     """
     engine = engine or MassSprings()
     episode = task.episode_fn(0) if episode is None else episode
-    require_episode(episode, task.body.num_particles)
+    episode = require_episode(episode, task.body.num_particles)
     return TaskProblem(
         space=action_space(task, candidates),
         episode=jax.tree.map(partial(jnp.asarray, dtype=float), episode),

@@ -86,6 +86,7 @@ def as_candidates(
             f"candidates {named}; give at least one of the ids 0 to {num_particles - 1} of a body "
             f"of {num_particles} particles"
         )
+    given = given.astype(given.dtype.newbyteorder("="), copy=False)  # JAX takes no other order
     ids, counts = np.unique(given, return_counts=True)
     if counts.max() > 1:
         raise ValueError(

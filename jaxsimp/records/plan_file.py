@@ -13,13 +13,15 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body, Material
+from jaxsimp.checks import as_reals
 from jaxsimp.dynamics import Actions, Obstacle
+from jaxsimp.dynamics.arrays import as_array
 from jaxsimp.dynamics.contact.obstacles import SHAPES
 from jaxsimp.dynamics.pickers import checked_actions, require_actions
 from jaxsimp.engines import Execution
@@ -34,6 +36,7 @@ MOST_BYTES = 2 * 10**9
 """Most bytes that a file may unpack to; a plan of 100 actions of 100,000 particles has 250 MB."""
 UNREADABLE = (
     ValueError,
+    OSError,
     EOFError,
     TypeError,
     KeyError,
@@ -46,6 +49,8 @@ UNREADABLE = (
     zlib.error,
 )
 """What damaged and foreign files raise."""
+NO_PLAN = "it is not a saved plan: give a file of save_plan"
+"""What every message of a foreign file ends with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,25 +139,26 @@ def save_plan(
         provenance: versions, commit, device and cores; `environment()` by default.
 
     Raises:
-        ValueError: if the plan, the episode or the positions are not of the task's body.
+        ValueError: if the plan, the episode or the positions are not of the task's body, the score
+            is no number, or further entries are no JSON.
     """
     actions = require_actions(actions, task.body.num_particles)
-    require_episode(episode, task.body.num_particles)
-    _require_frames(execution.positions, actions, task.body.num_particles)
+    episode = require_episode(episode, task.body.num_particles)
+    positions = _frames(execution.positions, actions, task.body.num_particles)
     about = {
         "task": _task_text(task),
         "engine": str(engine),
-        "score": execution.score if np.isfinite(execution.score) else None,
+        "score": _number_or_none("the score of the execution", execution.score),
         "status": execution.status.name,
         "missed": execution.missed,
         "body": _body_text(task.body),
-        "environment": dict(provenance or environment()),
-        "found": dict(found or {}),
+        "environment": _entries("provenance", environment() if provenance is None else provenance),
+        "found": _entries("found", {} if found is None else found),
     }
     arrays = {
         "pick": actions.pick,
         "displacement": actions.displacement,
-        "positions": execution.positions,
+        "positions": positions,
         "start": episode.start,
         "goal": episode.goal,
         "about": json.dumps(about),
@@ -165,11 +171,12 @@ def load_plan(path: str | Path) -> SavedPlan:
 
     Raises:
         ValueError: if the file holds no plan, or more than `MOST_BYTES`.
+        OSError: if the file cannot be opened.
     """
     arrays = _read(Path(path))
     missing = {"pick", "displacement", "positions"} - arrays.keys()
     if missing:
-        raise ValueError(f"{path} has no {', '.join(sorted(missing))}; it is not a saved plan")
+        raise ValueError(f"{path} has no {', '.join(sorted(missing))}; {NO_PLAN}")
     try:
         return _plan(arrays)
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
@@ -185,33 +192,66 @@ def _plan(arrays: Mapping[str, np.ndarray]) -> SavedPlan:
     positions = arrays["positions"]
     count = positions.shape[1] if positions.ndim == 3 else 0
     actions = checked_actions(arrays["pick"], arrays["displacement"], count)
-    _require_frames(positions, actions, count)
+    positions = _frames(positions, actions, count)
     if "about" not in arrays:
         return SavedPlan(actions, positions)
     about = json.loads(str(arrays["about"]))
     if not isinstance(about, dict) or not isinstance(about["body"], dict):
         raise ValueError("about is no description of a plan")
     body = _body(about["body"], arrays)
-    episode = Episode(arrays["start"], arrays["goal"])
-    require_episode(episode, body.num_particles)
+    episode = require_episode(Episode(arrays["start"], arrays["goal"]), body.num_particles)
     if body.num_particles != count:
         raise ValueError(f"positions are of {count} particles, the body of {body.num_particles}")
     return SavedPlan(actions, positions, body, episode, about)
 
 
-def _require_frames(positions: np.ndarray, actions: Actions, num_particles: int) -> None:
-    """Raise a `ValueError` unless positions are of an execution; those of a failed one are NaN."""
+def _frames(positions: Any, actions: Actions, num_particles: int) -> np.ndarray:
+    """The positions of an execution as an array, checked; those of a failed one are NaN."""
+    frames = np.asarray(as_array("positions", positions))
     wanted = (len(actions.pick) + 2, num_particles, 3)
-    if np.shape(positions) != wanted or not np.issubdtype(np.asarray(positions).dtype, np.floating):
+    if frames.shape != wanted:
         raise ValueError(
-            f"positions have shape {np.shape(positions)}; {wanted} is needed: at the start, after "
-            f"each action, and settled"
+            f"positions have shape {frames.shape}; give shape {wanted}: at the start, after each "
+            f"action, and settled"
         )
+    if not np.issubdtype(frames.dtype, np.floating):
+        raise ValueError(f"positions are an array of {frames.dtype}; give metres, as floats")
+    return frames
+
+
+def _number_or_none(name: str, value: Any) -> float | None:
+    """A number for JSON, which has none that are not finite."""
+    number = as_reals(value)
+    if number is None or number.ndim:
+        raise ValueError(f"{name} is {value!r}; give one real number")
+    return float(number) if np.isfinite(number) else None
+
+
+def _entries(name: str, given: Any) -> dict[str, Any]:
+    """Further entries of a file, which JSON can hold."""
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{name} is {given!r}; give a dictionary, as {{'search': 'CEM'}}")
+    try:
+        json.dumps(dict(given))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(
+            f"{name} is {given!r}, and no JSON ({error}); give numbers, texts, lists and "
+            f"dictionaries of texts"
+        ) from error
+    return dict(given)
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise OSError(error.errno, f"{error.strerror}; give a file of save_plan", path) from error
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
+    file = _opened(path)
     try:
-        with path.open("rb") as file:
+        with file:
             with zipfile.ZipFile(file) as archive:
                 size = sum(member.file_size for member in archive.infolist())
             if size > MOST_BYTES:
@@ -219,10 +259,12 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             file.seek(0)
             arrays = dict(np.load(file, allow_pickle=False))
     except UNREADABLE as error:
-        raise ValueError(f"{path} cannot be read ({error}); it is not a saved plan") from error
+        # NumPy's own words are how to load pickles.
+        why = "it holds pickled objects, or is no .npz" if "pickle" in str(error) else error
+        raise ValueError(f"{path} cannot be read ({why}); {NO_PLAN}") from error
     strange = [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]
     if strange:
-        raise ValueError(f"{path} has {strange[0]}, which is no array; it is not a saved plan")
+        raise ValueError(f"{path} has {strange[0]}, which is no array; {NO_PLAN}")
     return arrays
 
 
@@ -256,7 +298,7 @@ def _obstacle(told: Mapping[str, Any]) -> Obstacle:
     shape, numbers = told["shape"], {k: np.asarray(v) for k, v in told.items() if k != "shape"}
     if shape not in SHAPES:
         raise ValueError(
-            f"the plan's task has an obstacle of the shape {shape}; files are read with "
+            f"the plan's task has an obstacle of the shape {shape!r}; files are read with "
             f"{', '.join(SHAPES)}. Make the task by its own code"
         )
     return SHAPES[shape](**numbers)

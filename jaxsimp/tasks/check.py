@@ -49,7 +49,7 @@ def check_draw(draw_fn: DrawFn, num_particles: int) -> None:
         found = draw_fn(jax.random.key(0))
         return [found.start, found.goal] if isinstance(found, Episode) else []
 
-    found = _trace("draw_fn", draw, "it must accept a key, as made by jax.random.key")
+    found = _trace("draw_fn", draw, "let it take a key, as made by jax.random.key")
     shapes = [array.shape for array in found]
     if shapes != [(num_particles, 3)] * 2:
         raise ValueError(
@@ -74,12 +74,12 @@ def _check_cost(
     """Check one cost; `arguments` names its arguments: the first of the examples."""
     try:
         inspect.signature(cost).bind(*arguments)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:  # no function, or a built-in one
         raise ValueError(
             f"{name} is called as {name}({', '.join(arguments)}), which fails: {error}; give a "
-            f"function of these arguments"
+            f"function of {len(arguments)} arguments, {', '.join(arguments)}"
         ) from error
-    remedy = "it must accept positions of shape (N, 3), and an action of shapes (G,) and (G, 3)"
+    remedy = "let it take positions of shape (N, 3), and an action of shapes (G,) and (G, 3)"
     examples = partial(_examples, num_particles, num_pickers)
     found = _trace(name, lambda: cost(*examples()[: len(arguments)]), remedy)
     if not isinstance(found, jax.ShapeDtypeStruct):

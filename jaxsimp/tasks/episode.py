@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp.dynamics import Actions, State
-from jaxsimp.dynamics.pickers import require_metres
+from jaxsimp.dynamics.arrays import require_known, require_positions
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["start", "goal"], meta_fields=[])
@@ -27,8 +27,8 @@ class Episode:
     goal: Float[Array | np.ndarray, "... N 3"]
 
 
-def require_episode(episode: Any, num_particles: int) -> None:
-    """Check an episode of a body; under `jit` and `vmap` its shapes alone.
+def require_episode(episode: Any, num_particles: int) -> Episode:
+    """An episode of a body as arrays, checked; under `jit` and `vmap` its shapes and types alone.
 
     Raises:
         ValueError: if it is no `Episode`, or its start or goal are not finite positions of
@@ -39,14 +39,12 @@ def require_episode(episode: Any, num_particles: int) -> None:
             f"the episode is a {type(episode).__name__}; give Episode(start, goal), as a task's "
             f"episode_fn(seed) returns"
         )
+    arrays = {}
     for name in ("start", "goal"):
-        positions = getattr(episode, name)
-        if np.shape(positions) != (num_particles, 3):
-            raise ValueError(
-                f"the {name} of the episode has shape {np.shape(positions)}; a body of "
-                f"{num_particles} particles needs shape ({num_particles}, 3)"
-            )
-        require_metres(f"the {name} of the episode", positions)
+        told = f"the {name} of the episode"
+        arrays[name] = require_positions(told, getattr(episode, name), num_particles)
+        require_known(f"episode.{name}", arrays[name])
+    return Episode(**arrays)
 
 
 EpisodeFn = Callable[[int], Episode]

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import wraps
 
-from jaxsimp.checks import require_count
+from jaxsimp.checks import require_count, require_flag
 from jaxsimp.tasks.task import Task
 
 LEAST_RESOLUTION, MOST_RESOLUTION = 5, 10_000
@@ -69,7 +69,13 @@ def _named(task: Task, name: str, resolution: int) -> Task:
 
 
 def task_names(group: str | None = None) -> tuple[str, ...]:
-    """Names of the registered tasks of a group, or of all."""
+    """Names of the registered tasks of a group, or of all.
+
+    Raises:
+        ValueError: if the group is no text.
+    """
+    if group is not None and not isinstance(group, str):
+        raise ValueError(f"group is {group!r}; give the name of one, as 'paper', or None")
     return tuple(name for name, entry in _REGISTRY.items() if group in (None, entry.group))
 
 
@@ -87,6 +93,7 @@ def make_task(name: str, resolution: int | None = None, *, quick: bool = False) 
     """
     if not isinstance(name, str) or name not in _REGISTRY:
         raise ValueError(f"unknown task {name!r}; choose from {', '.join(_REGISTRY)}")
+    require_flag("quick", quick)
     entry = _REGISTRY[name]
     if resolution is None:
         resolution = entry.quick if quick else entry.full

@@ -1,5 +1,6 @@
 """Tasks, and the score of states."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -21,10 +22,18 @@ from jaxsimp.dynamics import (
     make_pickers,
     make_simulation,
 )
+from jaxsimp.dynamics.arrays import require_positions
 from jaxsimp.dynamics.contact.obstacles import check_obstacles, has_table
 from jaxsimp.dynamics.pickers import require_limits
 from jaxsimp.tasks.check import check_costs, check_draw
-from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
+from jaxsimp.tasks.episode import (
+    DrawFn,
+    Episode,
+    EpisodeFn,
+    RunningCost,
+    TerminalCost,
+    require_episode,
+)
 
 COUNTS = {"num_actions": (1, 10_000), "num_pickers": (1, 1000), "settle_actions": (0, 10_000)}
 """Least and most of a task's counts."""
@@ -82,11 +91,15 @@ class Task:
     def __post_init__(self) -> None:
         check_obstacles(self.obstacles, self.body)
         goals.check_goal(self.body, self.goal, has_table=has_table(self.obstacles))
-        require_limits(self.limits)
+        own: dict[str, object] = {"limits": require_limits(self.limits)}
+        if not isinstance(self.name, str):
+            raise ValueError(f"name is {self.name!r}; give a text")
         for name, counts in COUNTS.items():
-            require_count(name, getattr(self, name), *counts)
+            own[name] = require_count(name, getattr(self, name), *counts)
         for name, seconds in SECONDS.items():
-            require_number(name, getattr(self, name), *seconds, "s")
+            own[name] = require_number(name, getattr(self, name), *seconds, "s")
+        for name, plain in own.items():  # plan files hold plain numbers
+            object.__setattr__(self, name, plain)
         check_costs(
             self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
         )
@@ -168,8 +181,16 @@ def score(
         task: the task.
         episode: start and goal.
         state: the state to score, or positions at rest, shape (N, 3), metres.
+
+    Raises:
+        ValueError: if the episode or the state is not of the task's body.
     """
-    state = state if isinstance(state, State) else at_rest(state)
+    episode = require_episode(episode, task.body.num_particles)
+    moving = state if isinstance(state, State) else at_rest(state)
+    position = require_positions(
+        "the position of the state", moving.position, task.body.num_particles
+    )
+    state = dataclasses.replace(moving, position=position)
     start = task.terminal_cost(episode, at_rest(episode.start))
     ratio = _saved(start, task.terminal_cost(episode, state))
 

@@ -338,7 +338,7 @@ def test_what_is_no_plan_and_a_state_of_another_body_are_refused():
         rollout(simulation, pickers, at_rest(np.zeros((5, 3))), {"pick": 0})
     other = at_rest(np.zeros((4, 3)))
     idle = Actions(jnp.full((1, 2), NONE), jnp.zeros((1, 2, 3)))
-    message = r"position of shape \(4, 3\); this body of 5 .*\(5, 3\)"
+    message = r"position of the state has shape \(4, 3\); give shape \(5, 3\), one row of x, y, z"
     with pytest.raises(ValueError, match=message):
         rollout(simulation, pickers, other, idle)
     with pytest.raises(ValueError, match=message):

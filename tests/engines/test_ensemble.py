@@ -313,3 +313,12 @@ def test_what_no_ensemble_can_have_is_refused():
 def test_an_unknown_statistic_is_refused():
     with pytest.raises(ValueError, match="statistic is 'median'; choose from mean, worst"):
         make_ensemble(small_task(), 2, statistic="median")
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_spread_and_self_contact_are_of_their_types():
+    for spread in (0.5, jnp.asarray(0.5), {}, np.ones(2)):
+        with pytest.raises(ValueError, match=r"spread is .*; give Spread\(\.\.\.\), of factors"):
+            make_ensemble(small_task(), spread=spread)
+    with pytest.raises(ValueError, match="self_contact is 'yes'; give True or False"):
+        MassSprings(self_contact="yes")

@@ -241,3 +241,12 @@ assert "mujoco.mjx" in sys.modules
 def test_mujoco_is_imported_when_asked_for_and_says_nothing():
     run = subprocess.run([sys.executable, "-c", ALONE], check=True, capture_output=True, text=True)
     assert run.stdout == ""
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_state_of_another_body_is_not_compared():
+    body = rope(5)
+    with pytest.raises(ValueError, match=r"position of the state has shape \(4, 3\); give shape"):
+        compare_with_mjx(body, at_rest(body.rest[:4] + 1.0), 2)
+    with pytest.raises(ValueError, match=r"state.position\[0, 0\] is nan; give numbers"):
+        compare_with_mjx(body, at_rest(body.rest * np.nan), 2)

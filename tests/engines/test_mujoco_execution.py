@@ -169,5 +169,5 @@ def test_wrong_requests_are_refused():
     with pytest.raises(ValueError, match="num_workers is 0; give a whole number from 1"):
         replay(task, [], [], num_workers=0)
     start = np.array(task.episode_fn(0).start)
-    with pytest.raises(ValueError, match=r"start of the episode.* is nan"):
+    with pytest.raises(ValueError, match=r"episode.start.* is nan"):
         replay(task, [Episode(start * np.nan, start)], [random_plan(task, 0)])

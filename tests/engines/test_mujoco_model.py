@@ -364,7 +364,7 @@ def test_a_saved_model_is_the_same_model(body, variant, tmp_path):
 def test_unknown_variants_and_particles_are_refused():
     with pytest.raises(ValueError, match="variant is 'soft'; choose from fast, full"):
         make_model(rope(5), "soft")
-    with pytest.raises(ValueError, match="particle 5 cannot be grasped; a body of 5 particles has"):
+    with pytest.raises(ValueError, match="graspable names 5; the ids of 5 particles are 0 to 4"):
         make_model(rope(5), "fast", [5])
     with pytest.raises(ValueError, match=r"time_step is 0\.0; give a number from 1e-06 to 1 s"):
         Variant(0.0, elastic=True, self_collision=True)
@@ -450,9 +450,30 @@ def test_small_and_slack_bodies_come_to_rest_on_the_table(name, variant):
         ("one particle", r"has 1 particles and 0 springs; .* at least 2 particles, joined"),
         ("slack sheet", r"all springs of this cloth have stiffness 0; .* variant fast"),
         ("slack rope", r"all springs of this rope have stiffness 0; .* variant fast"),
-        ("no thickness", r"thickness of this rope is 0; .* metres above zero"),
+        ("no thickness", r"thickness of this rope is 0; give metres above zero"),
     ],
 )
 def test_what_mujoco_has_no_elastic_body_for_is_refused(name, message):
     with pytest.raises(ValueError, match=message):
         make_model(small(name), "full")
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_positions_and_graspable_particles_are_those_of_the_body(tmp_path):
+    body, path = rope(5), tmp_path / "model.xml"
+    for position, message in (
+        (0.5, r"position has shape \(\); give shape \(5, 3\), one row"),
+        (body.rest[:4], r"position has shape \(4, 3\); give shape \(5, 3\)"),
+        ("", "position is ''; give an array of real numbers"),
+        (body.rest * np.nan, r"position\[0, 0\] is nan; give numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_mjcf(path, body, position=position)
+    for graspable in (1e-320, [0.5], [[0, 1]], "01"):
+        with pytest.raises(ValueError, match=r"graspable is .*; give a"):
+            make_model(body, "fast", graspable)
+    with pytest.raises(ValueError, match="elastic is 1; give True or False"):
+        Variant(1e-3, elastic=1, self_collision=True)
+    with pytest.raises(OSError, match="Is a directory; give the path of a file") as refusal:
+        save_mjcf(tmp_path, body)
+    assert refusal.value.filename == str(tmp_path)

@@ -5,9 +5,11 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxsimp.dynamics import NONE, Actions, at_rest, rollout
 from jaxsimp.engines import MassSprings, plan_cost, settled_score, then_idle
+from jaxsimp.engines.rollouts import require_plan
 from jaxsimp.tasks import make_task
 
 
@@ -51,3 +53,12 @@ def test_the_settled_score_is_that_of_the_execution():
     found = settled_score(task, engine, engine.physics(task), episode, actions)
     done = engine.executor(task)(episode, actions)
     np.testing.assert_allclose(found, done.score, atol=1e-5)  # float32, other machine code
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_plan_of_other_types_is_carried_out_alike():
+    task = make_task("rope_folding", 5)
+    pick = np.zeros((task.num_actions, task.num_pickers), int)
+    kept = require_plan(task, Actions(pick.astype(np.uint8), np.zeros((*pick.shape, 3), np.int64)))
+    assert kept.pick.dtype == jnp.zeros(1, int).dtype
+    assert kept.displacement.dtype == jnp.zeros(1).dtype

@@ -9,14 +9,15 @@ from tests.fuzz.telling import spellings
 REMEDIES = """
 add ask call change check choose close convert cut decimate delete exchange export flatten free
 give increase install join keep lay leave let load lower make map move name open pass pick put
-raise read reduce remove rename repair replace run save say set settle spread start stop
+raise read reduce remove rename repair replace return run save say set settle spread start stop
 subdivide take turn use wait want wrap write
 """
 """Verbs that tell a user what to do."""
 LIMITS = """
-above another array below between distinct each file finite float folder four id ids integer itself
-json least mesh metres most names number numbers one only order out particle plan positive rope
-seconds shape sheet simple surface task text three triangles two unique up utf-8 whole zero
+above another array below between distinct each false file finite float folder four id ids integer
+itself json least mesh metres most names number numbers one only order out particle plan positive
+rope seconds shape sheet simple surface task text three triangles true two unique up utf-8 whole
+zero
 """
 """Words of what is allowed, besides numbers and lists of names."""
 
@@ -45,6 +46,8 @@ def names_value(text: str, values: Mapping[str, Any]) -> bool:
     """Whether a text names one of some values, a file, or a number that follows from them."""
     if any(spelled and spelled in text for each in values.values() for spelled in spellings(each)):
         return True
+    if any(callable(each) and name in text for name, each in values.items()):
+        return True  # a function has a name alone
     given, _, _ = text.partition(";")
     return bool(re.search(r"\d|\bnan\b|\binf\b|\bempty\b|\bno\b|/\w|'.*'", given))
 

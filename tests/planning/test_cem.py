@@ -282,3 +282,12 @@ def test_a_population_of_one(encoding):
     found = found_by(recorded(sphere, batches), encoding, population=1, num_iterations=3)
     assert np.isfinite(found.cost)
     assert [len(costs) for _, _, costs in batches] == [1, 1, 1]
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_settings_in_another_form_are_the_same_key_of_what_is_compiled():
+    given = CEM(initial_spread=jnp.asarray(0.5), smoothing=np.array(0.25))
+    assert given == CEM(initial_spread=0.5, smoothing=0.25)
+    assert hash(given) == hash(CEM(initial_spread=0.5, smoothing=0.25))
+    with pytest.raises(ValueError, match=r"keep_best is {}; give True or False"):
+        CEM(keep_best={})

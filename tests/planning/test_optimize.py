@@ -23,6 +23,7 @@ from jaxsimp.planning import (
     RandomShooting,
     Reranking,
     Sequence,
+    Told,
     make_problem,
     optimize,
     price,
@@ -368,3 +369,25 @@ def test_optimize_costs_plans_of_a_task_as_a_planner_does(name):
         np.testing.assert_allclose(costs, wanted, rtol=1e-5)
         np.testing.assert_allclose(together[0][index], costs, rtol=1e-5)
         assert np.ptp(costs) > 1e-3 * np.max(costs)  # it matters what is grasped
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("costs", "message"),
+    [
+        (np.ones((2, 1)), r"costs of shape \(2, 1\); return shape \(2,\), for 2 plans"),
+        (1.0, r"costs of shape \(\); return shape \(2,\)"),
+        (np.array([1j, 2.0]), "costs of evaluate is an array of complex128; give an array"),
+    ],
+)
+def test_costs_from_outside_are_one_for_each_plan(costs, message):
+    space, key = make_problem(make_task("rope_folding", 5), [0]).space, jax.random.key(0)
+    search = partial(search_on_host, RandomShooting(1, 2), space, key)
+    with pytest.raises(ValueError, match=message):
+        search(lambda *_: Told(costs))
+    with pytest.raises(ValueError, match=r"evaluate returns a list; return Told\(costs\)"):
+        search(lambda *_: [1.0, 2.0])
+    assert float(search(lambda *_: Told(np.array([3, 2]))).cost) == 2.0
+    wrong = Told(np.ones(1), np.zeros((1, 3)))
+    with pytest.raises(ValueError, match=r"gradients of shape \(1, 3\); return shape \(1, \d+, 2"):
+        search_on_host(Descent(num_asks=1), space, key, lambda *_: wrong)

@@ -338,7 +338,7 @@ def test_what_is_not_of_the_task_is_refused_at_the_door():
     start = np.array(episode.start)
     start[3, 1] = np.nan
     for wrong, message in (
-        (Episode(start, episode.goal), r"start of the episode\[3, 1\] is nan; give numbers"),
+        (Episode(start, episode.goal), r"episode.start\[3, 1\] is nan; give numbers"),
         (Episode(episode.start, start[:4]), r"goal of the episode has shape \(4, 3\).*\(5, 3\)"),
         (episode.start, r"the episode is a ndarray; give Episode\(start, goal\)"),
     ):

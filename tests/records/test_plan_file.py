@@ -96,7 +96,9 @@ def test_an_obstacle_of_another_shape_is_not_read(tmp_path):
     task = dataclasses.replace(rope_task(), obstacles=(Ball((0.0, 0.0, 0.0), 0.1),))
     path = tmp_path / "plan.npz"
     save_plan(path, task, task.episode_fn(0), PLAN, executed(), engine=MassSprings())
-    with pytest.raises(ValueError, match=r"obstacle of the shape Ball; files are read with Table"):
+    with pytest.raises(
+        ValueError, match=r"obstacle of the shape 'Ball'; files are read with Table"
+    ):
         load_plan(path).task()
 
 
@@ -265,7 +267,7 @@ def rewritten(path: Path, **changed) -> Path:
         ({"pick": np.array([[0.5, 0.0]])}, "pick is an array of float64"),
         ({"displacement": np.zeros((1, 1, 3))}, r"give shapes \(T, G\)"),
         ({"displacement": np.full((1, 2, 3), np.nan)}, "is nan; give numbers"),
-        ({"positions": np.zeros((2, 9, 3))}, r"shape \(2, 9, 3\); \(3, 9, 3\) is needed"),
+        ({"positions": np.zeros((2, 9, 3))}, r"shape \(2, 9, 3\); give shape \(3, 9, 3\)"),
         ({"positions": np.zeros(3)}, r"a body of 0 particles|shape \(3,\)"),
         ({"start": np.zeros((8, 3))}, r"start of the episode has shape \(8, 3\)"),
         ({"start": None}, "KeyError: has no 'start'"),
@@ -310,7 +312,7 @@ def test_what_is_no_plan_of_the_task_is_not_saved(tmp_path):
     for arguments, message in (
         ((episode, far, executed()), "is 9; a body of 9"),
         ((other, PLAN, executed()), r"start of the episode has shape \(4, 3\)"),
-        ((episode, PLAN, long), r"shape \(5, 9, 3\); \(3, 9, 3\) is needed"),
+        ((episode, PLAN, long), r"shape \(5, 9, 3\); give shape \(3, 9, 3\)"),
     ):
         with pytest.raises(ValueError, match=message):
             save_plan(str(tmp_path / "plan.npz"), task, *arguments, engine="mine")
@@ -324,3 +326,58 @@ def test_a_damaged_task_is_told(tmp_path):
     path = rewritten(tmp_path / "plan.npz", about=json.dumps(about))
     with pytest.raises(ValueError, match=r"of the task is damaged \(KeyError: 'limits'"):
         load_plan(path).task()
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"found": 3}, "found is 3; give a dictionary"),
+        ({"found": {1j: 1}}, "found is .*, and no JSON .*; give numbers, texts"),
+        ({"found": {"cost": np.float32(1)}}, r"no JSON \(Object of type float32"),
+        ({"score": {}}, "the score of the execution is {}; give one real number"),
+        ({"score": np.ones(2)}, "the score of the execution is array.*; give one real number"),
+    ],
+)
+def test_what_a_file_cannot_hold_is_not_saved(tmp_path, changed, message):
+    execution = dataclasses.replace(
+        executed(), **{k: v for k, v in changed.items() if k == "score"}
+    )
+    with pytest.raises(ValueError, match=message):
+        save_plan(
+            tmp_path / "plan.npz",
+            rope_task(),
+            rope_task().episode_fn(0),
+            PLAN,
+            execution,
+            engine="mine",
+            found=changed.get("found"),
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_other_bytes_and_a_score_of_jax_are_saved_as_they_are(tmp_path):
+    moves = np.asarray(PLAN.displacement)
+    other = Actions(np.asarray(PLAN.pick), moves.astype(moves.dtype.newbyteorder()))
+    execution = dataclasses.replace(executed(), score=jnp.asarray(0.5))
+    path = tmp_path / "plan.npz"
+    save_plan(path, rope_task(), rope_task().episode_fn(0), other, execution, engine="mine")
+    found = load_plan(path)
+    np.testing.assert_array_equal(found.actions.displacement, moves)
+    assert found.about["score"] == 0.5
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_name_that_is_no_text_is_no_task(tmp_path):
+    path = tmp_path / "plan.npz"
+    write(path)
+    about = json.loads(str(np.load(path)["about"]))
+    about["task"]["name"] = 3
+    with pytest.raises(ValueError, match="name is 3; give a text"):
+        load_plan(rewritten(path, about=json.dumps(about))).task()
+
+
+def test_a_folder_is_no_plan(tmp_path):
+    with pytest.raises(IsADirectoryError, match="give a file of save_plan"):
+        load_plan(tmp_path)

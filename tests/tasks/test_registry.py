@@ -104,3 +104,11 @@ def test_a_registered_task_has_the_name_of_its_factory_and_its_resolution(own_re
         assert (task.name, task.resolution) == ("mine", resolution)
     assert mine.__doc__ == "Documented."
     assert dataclasses.replace(make_task("rope_folding", 9), num_actions=2).name == "rope_folding"
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_scale_is_true_or_false_and_a_group_a_name():
+    with pytest.raises(ValueError, match="quick is 'no'; give True or False"):
+        make_task("rope_folding", quick="no")
+    with pytest.raises(ValueError, match="group is 3; give the name of one"):
+        task_names(3)

@@ -100,3 +100,23 @@ def test_score_of_positions_is_that_of_their_state_at_rest():
     task = dataclasses.replace(task, terminal_cost=speed)
     assert float(score(task, episode, position)) == 0.0
     assert float(score(task, episode, state)) == -1.0
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_what_is_no_state_of_the_body_has_no_score():
+    task = make_task("rope_folding", 5)
+    start, goal = map(np.asarray, (task.episode_fn(0).start, task.episode_fn(0).goal))
+    nowhere = start * np.nan
+    for episode, state, message in (
+        (Episode(start, goal), np.inf, r"position has shape \(\); give shape \(N, 3\)"),
+        (Episode(start, goal), goal[:4], r"state has shape \(4, 3\); give shape \(5, 3\)"),
+        (Episode(start, goal[:1]), goal, r"goal of the episode has shape \(1, 3\); give shape"),
+        (Episode(nowhere, goal), goal, r"episode.start\[0, 0\] is nan; give numbers"),
+        (start, goal, r"the episode is a ndarray; give Episode"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            score(task, episode, state)
+    big = start.astype(start.dtype.newbyteorder())
+    found = score(task, Episode(big, goal.tolist()), goal)
+    assert found == score(task, Episode(start, goal), goal)
+    assert jnp.isnan(score(task, Episode(start, goal), nowhere))

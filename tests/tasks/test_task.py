@@ -245,7 +245,7 @@ def test_a_running_cost_sees_an_action_of_all_pickers():
             lambda key: Episode(*np.random.default_rng(int(key)).uniform(size=(2, 9, 3))),
             r"asks for the values of arrays",
         ),
-        (lambda: None, r"fails with TypeError: .*; it must accept a key"),
+        (lambda: None, r"fails with TypeError: .*; let it take a key"),
     ],
 )
 def test_what_draws_no_episode_by_a_key_is_refused(draw_fn, said):
@@ -282,3 +282,14 @@ def test_a_goal_below_the_edge_of_a_table_is_a_goal():
     dataclasses.replace(task, goal=below, obstacles=(table_with_edge(-1.0),))
     with pytest.raises(ValueError, match="under the table"):
         dataclasses.replace(task, goal=below)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_numbers_in_another_form_are_kept_as_plain_ones():
+    given = {"limits": np.array([0.1, 0.2, 0.3]), "num_actions": np.int64(3)}
+    task = changed(action_seconds=jnp.asarray(0.5), **given)
+    assert task.limits == (0.1, 0.2, 0.3)
+    assert type(task.num_actions) is int
+    assert type(task.action_seconds) is float
+    with pytest.raises(ValueError, match="name is 3; give a text"):
+        changed(name=3)

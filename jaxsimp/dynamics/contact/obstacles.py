@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.material import FAMILIES
 from jaxsimp.bodies.meshes import covering_radii
-from jaxsimp.checks import as_reals
+from jaxsimp.checks import as_reals, require_number
 
 Values = Float[Array | np.ndarray, "..."] | float
 """One number for each point."""
@@ -145,7 +145,10 @@ class Capsule:
     def size(self) -> tuple[str, float]:
         """See `Obstacle`."""
         if not np.linalg.norm(np.subtract(self.end, self.start)) >= SHORTEST:
-            raise ValueError(f"start and end are both {_told(self.end)}; give a Sphere instead")
+            raise ValueError(
+                f"start and end are both {_told(self.end)}; give two points at least "
+                f"{SHORTEST:g} m apart, or a Sphere instead"
+            )
         return "radius", _positive("radius", self.radius)
 
 
@@ -212,7 +215,15 @@ def table_with_edge(
         rounding: radius of the edge, metres.
         half_width: half the length and width of the top, metres.
         height: thickness of the block under the top, metres.
+
+    Raises:
+        ValueError: if a number that is known is out of its range.
     """
+    sizes = {"rounding": rounding, "half_width": half_width, "height": height}
+    ranges = {"edge": (edge, -FARTHEST)} | {name: (size, 0.0) for name, size in sizes.items()}
+    for name, (value, lowest) in ranges.items():
+        if not isinstance(value, jax.core.Tracer):
+            require_number(name, value, lowest, FARTHEST, "m")
     center = (edge - half_width, 0.0, -height / 2)
     return Box(center, (half_width, half_width, height / 2), rounding)
 
@@ -306,7 +317,8 @@ def _numbers(obstacle: Any) -> dict[str, np.ndarray]:
     for field in dataclasses.fields(obstacle):
         given = getattr(obstacle, field.name)
         value = as_reals(given)
-        shape = SHAPES_OF_NUMBERS.get(field.type, np.shape(given))
+        own = () if value is None else value.shape
+        shape = SHAPES_OF_NUMBERS.get(field.type, own)
         if value is None or value.shape != shape or not np.all(np.abs(value) <= FARTHEST):
             wanted = {(): "a finite number", (3,): "three finite numbers"}.get(
                 shape, "finite numbers"

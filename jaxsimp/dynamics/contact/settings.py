@@ -16,6 +16,8 @@ from jaxsimp.checks import require_number
 
 TOP_SPEED = 2.1
 """Default of the fastest that pickers may move, metres per second."""
+LEAST_SPEED, MOST_SPEED = 1e-12, 1e9
+"""Range of the fastest that pickers may move, metres per second: a task of any limits is in it."""
 LEVEL = 0.3
 """Layers closer than this, as a fraction of the thickness, count as side by side."""
 SEARCH = 1.5
@@ -136,7 +138,7 @@ def make_self_contact(
         )
     friction = body.material.friction if friction is None else friction
     require_number("friction", friction, 0.0, 1e3)
-    require_number("top_speed", top_speed, 0.0, 1e6, "m/s")
+    require_number("top_speed", top_speed, 0.0, MOST_SPEED, "m/s")
     is_sheet = len(body.faces) > 0
     layers = MOST_LAYERS_OF_SHEETS if is_sheet else MOST_LAYERS_OF_ROPES
     fastest = layers * thickness / time_step

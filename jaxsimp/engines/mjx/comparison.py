@@ -17,6 +17,7 @@ from jaxsimp.dynamics import (
     make_simulation,
     rollout,
 )
+from jaxsimp.dynamics.simulation import require_state
 from jaxsimp.dynamics.springs import pull, spring_tensions
 from jaxsimp.dynamics.step import pack
 from jaxsimp.engines.mjx.engine import MJXSimulation, make_mjx_simulation, mjx_trajectory
@@ -57,10 +58,11 @@ def compare_with_mjx(
         gravity: downward acceleration, metres per second squared.
 
     Raises:
-        ValueError: if the body reaches the table, `num_steps` is no whole number above zero, or
-            `make_mjx_simulation` raises.
+        ValueError: if the state is not of the body, the body reaches the table, `num_steps` is no
+            whole number above zero, or `make_mjx_simulation` raises.
     """
     num_steps = require_count("num_steps", num_steps, 1)
+    state = require_state(state, body.num_particles)
     ours = make_simulation(body, time_step, gravity)
     theirs = make_mjx_simulation(body, time_step, gravity)
     lowest, found = jax.jit(_compare, static_argnames="num_steps")(ours, theirs, state, num_steps)

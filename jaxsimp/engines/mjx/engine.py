@@ -31,6 +31,7 @@ from jaxsimp.dynamics import (
 )
 from jaxsimp.dynamics.contact.rigid import contact
 from jaxsimp.dynamics.pickers import grasp, require_actions, speed_profile
+from jaxsimp.dynamics.simulation import require_state
 from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.mjx.tendons import tendon_spec
 from jaxsimp.engines.rollouts import RolloutExecutor
@@ -149,8 +150,10 @@ def mjx_rollout(
     """Carry out a plan in MJX; arguments and result are those of `SearchEngine.rollout`.
 
     Raises:
-        ValueError: if `jaxsimp.dynamics.pickers.require_actions` refuses the plan.
+        ValueError: if `jaxsimp.dynamics.pickers.require_actions` refuses the plan, or
+            `jaxsimp.dynamics.simulation.require_state` the state.
     """
+    state = require_state(state, len(simulation.ours.mass))
     actions = require_actions(actions, len(simulation.ours.mass))
 
     def act(state: State, action: Actions) -> tuple[State, PyTree[Any]]:

@@ -94,8 +94,7 @@ def replay(
         )
     if num_workers is not None:
         require_count("num_workers", num_workers, 1, MOST_WORKERS)
-    for episode in episodes:
-        require_episode(episode, task.body.num_particles)
+    episodes = [require_episode(episode, task.body.num_particles) for episode in episodes]
     plans = [require_actions(plan, task.body.num_particles) for plan in plans]
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
     model = make_model(task.body, variant, picked, obstacles=task.obstacles)

@@ -27,8 +27,9 @@ from jaxtyping import Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import face_areas
 from jaxsimp.bodies.topology import are_among, chain, half_edges
-from jaxsimp.checks import require_choice, require_number
+from jaxsimp.checks import require_choice, require_flag, require_ids, require_number
 from jaxsimp.dynamics import Obstacle, Table, largest_time_step
+from jaxsimp.dynamics.arrays import require_known, require_positions
 from jaxsimp.dynamics.contact.obstacles import make_obstacles
 from jaxsimp.engines.mujoco.geoms import obstacle_geoms
 
@@ -57,6 +58,8 @@ class Variant:
 
     def __post_init__(self) -> None:
         require_number("time_step", self.time_step, 1e-6, 1.0, "s")
+        require_flag("elastic", self.elastic)
+        require_flag("self_collision", self.self_collision)
 
 
 VARIANTS = {
@@ -153,13 +156,21 @@ def save_mjcf(
         obstacles: as for `make_model`.
 
     Raises:
-        ValueError: as for `make_model`.
+        ValueError: as for `make_model`, or if positions are not those of the body.
+        OSError: if the file cannot be written.
     """
     spec = _spec(body, as_variant(variant), graspable, obstacles)
     if position is not None:
-        spec.add_key(name="start", qpos=(position - body.rest).ravel().tolist())
+        places = require_positions("position", position, body.num_particles)
+        require_known("position", places)
+        spec.add_key(name="start", qpos=(np.asarray(places) - body.rest).ravel().tolist())
     spec.compile()
-    Path(path).write_text(spec.to_xml())
+    try:
+        Path(path).write_text(spec.to_xml())
+    except OSError as error:
+        raise OSError(
+            error.errno, f"{error.strerror}; give the path of a file that can be written", str(path)
+        ) from error
 
 
 def _spec(
@@ -196,7 +207,7 @@ def _spec(
     for name, geom in geoms.items():
         spec.worldbody.add_geom(name=name, rgba=[0.9, 0.9, 0.88, 1.0], **geom, **contact)
     spec.worldbody.add_light(pos=[0.0, 0.0, 2.0])
-    for particle in sorted(set(map(int, graspable))):
+    for particle in _ids(graspable, body):
         _add_picker(spec, body, particle)
     return spec
 
@@ -206,11 +217,12 @@ def _check_body(body: Body, variant: Variant) -> None:
     if body.num_particles < 2 or not len(body.springs):
         raise ValueError(
             f"this {body.name} has {body.num_particles} particles and {len(body.springs)} springs; "
-            f"a flexible body of MuJoCo takes at least 2 particles, joined by a spring"
+            f"give at least 2 particles, joined by a spring, as a flexible body of MuJoCo takes"
         )
     if not body.radius > 0:
         raise ValueError(
-            f"the thickness of this {body.name} is 0; MuJoCo's contact takes metres above zero"
+            f"the thickness of this {body.name} is 0; give metres above zero, as MuJoCo's contact "
+            f"takes"
         )
     if variant.elastic and not body.stiffness.any():
         raise ValueError(
@@ -291,15 +303,25 @@ def _set_rope(flex: Any, body: Body) -> None:
     flex.young = bending_rigidity(body) / (np.pi * flex.radius**4 / 4)
 
 
+def _ids(graspable: Iterable[int], body: Body) -> list[int]:
+    """Ids of particles that can be grasped, each once, in order.
+
+    Raises:
+        ValueError: if one is no particle of the body.
+    """
+    given = list(graspable) if np.iterable(graspable) else graspable
+    if isinstance(given, list) and not given:
+        return []
+    ids = require_ids("graspable", given, body.num_particles)
+    if ids.ndim != 1:
+        raise ValueError(f"graspable is {graspable!r}; give a list of particle ids")
+    return np.unique(ids).tolist()
+
+
 def _add_picker(spec: Any, body: Body, particle: int) -> None:
     """Add a picker of one particle: a mocap body, joined to it by a switchable constraint."""
     import mujoco
 
-    if not 0 <= particle < body.num_particles:
-        raise ValueError(
-            f"particle {particle} cannot be grasped; a body of {body.num_particles} particles has "
-            f"ids 0 to {body.num_particles - 1}"
-        )
     name = f"picker_{particle}"
     spec.worldbody.add_body(name=name, mocap=True, pos=body.rest[particle])
     spec.add_equality(

@@ -168,6 +168,11 @@ def _roll(pick: Any = PICK, displacement: Any = MOVE, position: Any = REST) -> A
     return js.rollout(SIMULATION, PICKERS, js.at_rest(position), actions)
 
 
+def is_plain(array: Any) -> bool:
+    """Whether an array is one of numbers, of JAX or NumPy's own."""
+    return is_jax(array) or (type(array) is np.ndarray and array.dtype.kind in "iuf")
+
+
 def is_plan(pick: Any, displacement: Any, num_particles: int, shape: Any = None) -> bool | None:
     """Whether picks and displacements are a plan: ids or -1, and finite metres."""
     ids, moves = as_floats(pick), as_floats(displacement)
@@ -177,7 +182,7 @@ def is_plan(pick: Any, displacement: Any, num_particles: int, shape: Any = None)
         return False
     if not np.isin(ids, range(-1, num_particles)).all() or (shape and ids.shape != shape):
         return False
-    plain = all(is_jax(each) or type(each) is np.ndarray for each in (pick, displacement))
+    plain = all(is_plain(each) for each in (pick, displacement))
     return True if plain and np.abs(moves).max(initial=0) < 10 and ids.size else None
 
 

@@ -1,5 +1,6 @@
 """Engines: ensembles, layouts, models of MuJoCo and MJX, replays."""
 
+from contextlib import chdir
 from typing import Any
 
 import numpy as np
@@ -168,7 +169,8 @@ def _check_replay(result: Any, **_: Any) -> None:
 
 
 def _save(path: Any, position: Any = None) -> Any:
-    js.save_mjcf(path, TASK.body, position=position)
+    with chdir(FOLDER):  # names such as "nan" are files there
+        js.save_mjcf(path, TASK.body, position=position)
     return path
 
 

@@ -98,7 +98,11 @@ def _scored(start: Any = EPISODE.start, goal: Any = GOAL, state: Any = GOAL) -> 
 
 
 def _is_scored(**given: Any) -> bool | None:
-    return both(*(is_shaped(each, (25, 3)) for each in given.values()))
+    verdicts = [is_shaped(each, (25, 3)) for each in given.values()]
+    if False in verdicts:
+        return False
+    near = all(np.abs(as_floats(each)).max() < 1e6 for each in given.values())  # else no metres
+    return both(*verdicts, True if near else None)
 
 
 def _check_score(
