@@ -95,7 +95,8 @@ def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) 
         "# Transfer: plans found in our dynamics, carried out in MuJoCo",
         "",
         f"A plan transfers when its settled score is at least {study.success_score}. Score 1 is a "
-        f"cost of 0, which a goal need not have, and 0 is the start. {study.plans.seeds} seeds a row; intervals are 95 % (Wilson). "
+        f"cost of 0, which a goal need not have, and 0 is the start. {study.plans.seeds} seeds a "
+        "row; intervals are 95 % (Wilson). "
         "Fast: hardly stretches, limp, layers pass through others. Full: elastic as our springs "
         "are, with self-collision and friction between layers.",
         "",

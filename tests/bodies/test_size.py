@@ -96,13 +96,16 @@ def test_an_extent_is_a_number(extent):
         (lambda: ROPE.scaled(mass=[1.0, 2.0]), r"the factor of mass is \[1.0, 2.0\]; give"),
         (lambda: ROPE.scaled(stiffness=np.ones(3)), r"stiffness has shape \(3,\); give one factor"),
         (lambda: from_mesh(CLOTH.rest, 1.0 * CLOTH.faces), "faces is an array of float64, shape"),
-        (lambda: from_mesh(CLOTH.rest > 0, CLOTH.faces), "points holds no real numbers; give a"),
+        (
+            lambda: from_mesh(CLOTH.rest > 0, CLOTH.faces),
+            "points is an array of bool, .*; give real numbers, a row",
+        ),
         (lambda: from_mesh(CLOTH.rest[:0], CLOTH.faces), "a triangle names .*, and there are no"),
         (lambda: from_mesh(CLOTH.rest, CLOTH.faces, scale=1j), "scale is 1j; give a number"),
         (lambda: rope_along(ROPE.rest[:, :2]), r"points is an array of shape \(5, 2\); give rows"),
         (lambda: replace(ROPE, faces=np.zeros((0, 3))), "faces is an array of float64, shape"),
         (lambda: replace(ROPE, mass="heavy"), "mass holds no real numbers; give an array in kg"),
-        (lambda: replace(ROPE, mass=2.0), r"mass has shape \(\); \(5,\) is needed: the body has 5"),
+        (lambda: replace(ROPE, mass=2.0), r"mass has shape \(\); give shape \(5,\), for 5"),
         (
             lambda: replace(ROPE, rest=ROPE.rest + 1e300),
             r"rest\[0, 0\] is .*from -50 to 50 m|0 m; a b",

@@ -117,6 +117,7 @@ def _one(body: js.Body) -> Door:
         lambda goal, **options: _is_call(body, goal, **options),
         lambda points, goal, **options: _check_one(points, body, goal, **options),
         weight=20,
+        prepare=lambda: js.simplify(body, GOALS[id(body)][1]),  # which compiles
     )
 
 
