@@ -107,7 +107,7 @@ def require_ids(name: str, values: object, count: int, of: str = "particles") ->
     array = require_whole(name, values)
     wrong = array[(array < 0) | (array >= count)]
     if wrong.size and not count:
-        raise ValueError(f"{name} names {wrong[0]}, and there are no {of}; give them first")
+        raise ValueError(f"{name} names {wrong[0]}, and there are no {of}; give at least one first")
     if wrong.size:
         raise ValueError(
             f"{name} names {wrong[0]}; the ids of {count} {of} are 0 to {count - 1}: give one of "

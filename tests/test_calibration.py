@@ -240,6 +240,11 @@ def bad_recordings() -> dict[str, tuple[Recording, str]]:
             replace(ok, start=State(jnp.ones((5, 3)), jnp.ones((5, 3)))),
             r"start.position .* \(6, 3\)",
         ),
+        "far": (
+            replace(ok, start=State(jnp.full((6, 3), 1e29), jnp.zeros((6, 3)))),
+            r"start.position of recording 1\[0, 0\] is 1e\+29; give numbers from -1e\+06",
+        ),
+        "none": (None, r"recording 1 is None; give Recording\(State"),
         "not finite": (
             replace(ok, positions=ok.positions.at[1, 2, 0].set(jnp.nan)),
             "recording 1 has a value that is not finite",
@@ -249,7 +254,8 @@ def bad_recordings() -> dict[str, tuple[Recording, str]]:
 
 @pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize(
-    "name", ["particles", "frames", "actions", "displacements", "start", "not finite"]
+    "name",
+    ["particles", "frames", "actions", "displacements", "start", "far", "none", "not finite"],
 )
 def test_recordings_that_do_not_fit_are_refused(name):
     recording, message = bad_recordings()[name]

@@ -80,7 +80,7 @@ def test_ids_of_any_whole_type_and_shape_are_int64(values):
         ([0, 3], 3, "faces names 3; the ids of 3 points are 0 to 2: give one of"),
         ([-1], 3, "faces names -1; the ids of 3 points"),
         ([2**40], 3, "faces names 1099511627776"),
-        ([0], 0, "faces names 0, and there are no points; give them first"),
+        ([0], 0, "faces names 0, and there are no points; give at least one first"),
         ([0.0], 3, r"faces is \[0.0\]; give an array of whole numbers"),
         ([True], 3, r"faces is \[True\]; give an array of whole"),
         ([[0], [1, 2]], 3, "faces is .*; give an array of whole"),
@@ -148,7 +148,7 @@ def test_a_masked_value_is_not_known():
     masked = np.ma.masked_array([[1.0, 2.0]], [[False, True]])
     with pytest.raises(ValueError, match=r"mass\[0, 1\] is nan; give numbers from 0 to 9 kg"):
         require_numbers("mass", masked, 0.0, 9.0, "kg")
-    with pytest.raises(ValueError, match="faces is .*; give an array of whole numbers"):
+    with pytest.raises(ValueError, match=r"faces is .*; give an array of whole numbers"):
         require_whole("faces", np.ma.masked_array([1, 2], [False, True]))
     whole = np.ma.masked_array([[1.0, 2.0]])
     assert type(require_numbers("mass", whole, 0.0, 9.0)) is np.ndarray

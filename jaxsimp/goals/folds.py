@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.garments import Garment
 from jaxsimp.bodies.topology import boundary_edges, half_edges
-from jaxsimp.checks import as_reals, require_rows, require_shape, told
+from jaxsimp.checks import as_reals, require_choice, require_rows, require_shape, told
 from jaxsimp.goals.shapes import Positions, flat, require_flat
 
 
@@ -151,6 +151,7 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
     Raises:
         ValueError: if the name is unknown, or the cloth is not square for "four_corners".
     """
+    require_choice("fold", name, ("side", "diagonal", "quarter", "letter", "four_corners"))
     x, y = np.ptp(body.rest[:, :2], axis=0) / 2
     side = _fold_about((0.0, 0.0), (0.0, 1.0))
     if name == "side":
@@ -161,18 +162,16 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
         return side, _fold_about((0.0, 0.0), (1.0, 0.0))
     if name == "letter":
         return _fold_about((-x / 3, 0.0), (0.0, 1.0)), _fold_about((x / 3, 0.0), (0.0, -1.0))
-    if name == "four_corners":
-        if not np.isclose(x, y, rtol=0.01):
-            raise ValueError(
-                f"the {body.name} is {2 * x:.4g} m by {2 * y:.4g} m; only the corners of a "
-                f"square are folded to the centre"
-            )
-        # The corner lies to the left of the line through the middles of its sides.
-        return tuple(
-            _fold_about((a * x / 2, b * y / 2), (b, -a))
-            for a, b in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    if not np.isclose(x, y, rtol=0.01):
+        raise ValueError(
+            f"the {body.name} is {2 * x:.4g} m by {2 * y:.4g} m; only the corners of a square are "
+            f"folded to the centre: choose other folds"
         )
-    raise ValueError(f"fold is {name!r}; choose from side, diagonal, quarter, letter, four_corners")
+    # The corner lies to the left of the line through the middles of its sides.
+    return tuple(
+        _fold_about((a * x / 2, b * y / 2), (b, -a))
+        for a, b in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    )
 
 
 def sleeves_in(shirt: Garment) -> tuple[Fold, Fold]:

@@ -95,6 +95,9 @@ def test_an_extent_is_a_number(extent):
         (lambda: MATERIALS["rope"].scaled(drag="2"), "the factor of drag is '2'; give a number"),
         (lambda: ROPE.scaled(mass=[1.0, 2.0]), r"the factor of mass is \[1.0, 2.0\]; give"),
         (lambda: ROPE.scaled(stiffness=np.ones(3)), r"stiffness has shape \(3,\); give one factor"),
+        (lambda: ROPE.scaled(stiffness=b"1"), "stiffness is b'1'; give an array of numbers"),
+        (lambda: cloth(np.array(0.5)), r"shape is array\(0.5\); give two numbers"),
+        (lambda: replace(ROPE, name=np.nan), "name is nan; give a text, such as"),
         (lambda: from_mesh(CLOTH.rest, 1.0 * CLOTH.faces), "faces is an array of float64, shape"),
         (
             lambda: from_mesh(CLOTH.rest > 0, CLOTH.faces),
