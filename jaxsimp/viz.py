@@ -115,7 +115,7 @@ def plot_scores(
     figure, panels = _panels(scores)
     for axes, (name, methods) in zip(panels, scores.items(), strict=True):
         shown = np.concatenate([np.array([[success, success]]), *methods.values()])
-        low = min(0.0, float(np.nanmin(shown))) - 0.05
+        low = min(0.0, float(shown[np.isfinite(shown)].min(initial=0.0))) - 0.05
         axes.plot([low, 1.05], [low, 1.05], color=GOAL_COLOR, lw=0.8)
         axes.axhline(success, color=GOAL_COLOR, ls="--", lw=0.8)
         for index, (method, pairs) in enumerate(methods.items()):

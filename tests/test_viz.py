@@ -357,3 +357,9 @@ def test_plans_of_different_lengths_have_a_frame_for_each_action():
 def test_a_goal_at_one_place_is_drawn():
     figure = viz.plot_simplifications({"a": (rope(9), np.zeros((9, 3)), rope_model())})
     figure.canvas.draw()
+
+
+def test_scores_that_are_not_finite_are_left_out_of_the_limits():
+    pairs = np.array([[0.9, -np.inf], [0.5, np.nan], [-0.2, 0.3]])
+    figure = viz.plot_scores({"a": {"m": pairs}}, "ours", "theirs", 0.9)
+    assert figure.axes[0].get_xlim() == pytest.approx((-0.25, 1.05))
