@@ -20,6 +20,7 @@ from rich.console import Console
 from experiments.progress import progress_bar
 from experiments.study import teller
 from jaxsimp import records
+from jaxsimp.checks import require_count
 from jaxsimp.engines import MassSprings, SearchEngine, Spread, goal_scores, make_ensemble
 from jaxsimp.planning import CEM, ENCODINGS, Planner
 from jaxsimp.simplification import METHODS, KeyPoints, simplify
@@ -130,10 +131,9 @@ class PlanStudy:
         _require_known("method", (self.method,), tuple(METHODS))
         _require_known("action space", self.action_spaces, ACTION_SPACES)
         _require_known("pick encoding", self.pick_encodings, tuple(ENCODINGS))
-        if self.seeds < 1:
-            raise ValueError(f"seeds is {self.seeds}; at least 1 is needed")
-        if self.num_actions is not None and self.num_actions < 1:
-            raise ValueError(f"num_actions is {self.num_actions}; at least 1 is needed")
+        require_count("seeds", self.seeds, 1)
+        if self.num_actions is not None:
+            require_count("num_actions", self.num_actions, 1)
         for name in self.tasks:  # Raises for a wrong resolution or setting before any run.
             self.search_config(self.task(name))
 

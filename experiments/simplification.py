@@ -30,6 +30,7 @@ from experiments.settled_goals import SETTLED_FOLDS, settled_goal
 from experiments.study import default_folder, teller
 from jaxsimp import records
 from jaxsimp.bodies import Body, cloth, rope
+from jaxsimp.checks import require_count
 from jaxsimp.simplification import METHODS, simplify_batch
 
 ROWS_FILE = "goals.jsonl"
@@ -70,8 +71,7 @@ class SimplificationStudy:
                 raise ValueError(f"unknown method {name!r}; choose from {', '.join(METHODS)}")
         if not self.methods:
             raise ValueError(f"no method is given; choose from {', '.join(METHODS)}")
-        if self.seeds < 1:
-            raise ValueError(f"seeds is {self.seeds}; at least 1 is needed")
+        require_count("seeds", self.seeds, 1)
 
     def identity(self) -> dict[str, Any]:
         """Identity of a folder of results."""

@@ -18,8 +18,18 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.material import PARAMETERS
-from jaxsimp.checks import require_count, require_number
-from jaxsimp.dynamics.pickers import Actions, Pickers, make_pickers, require_actions
+from jaxsimp.checks import (
+    require_choice,
+    require_count,
+    require_ids,
+    require_number,
+    require_numbers,
+    require_reals,
+    require_shape,
+    require_whole,
+    told,
+)
+from jaxsimp.dynamics.pickers import FARTHEST, Actions, Pickers, make_pickers, require_actions
 from jaxsimp.dynamics.rollouts import rollout
 from jaxsimp.dynamics.simulation import Simulation, State, largest_time_step, make_simulation
 from jaxsimp.dynamics.springs import make_springs
@@ -79,11 +89,14 @@ class CalibrationConfig:
     longest_time_step: float = LONGEST_TIME_STEP
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.parameters if name not in PARAMETERS]
-        if unknown or not self.parameters:
+        if not isinstance(self.parameters, tuple | list) or not self.parameters:
             raise ValueError(
-                f"parameters is {self.parameters}; choose from {', '.join(PARAMETERS)}"
+                f"parameters is {told(self.parameters)}; give a tuple of names, of "
+                f"{', '.join(PARAMETERS)}"
             )
+        for name in self.parameters:
+            require_choice("a name in parameters", name, PARAMETERS)
+        object.__setattr__(self, "parameters", tuple(self.parameters))  # hashed, when compiled
         require_count("steps", self.steps, 1, 1_000_000)
         require_number("learning_rate", self.learning_rate, 1e-6, 10.0)
         require_number("largest_factor", self.largest_factor, 1.001, 1e6)
@@ -137,8 +150,8 @@ def calibrate(
 
     Raises:
         ValueError: if recordings do not fit the body or each other, hold a value that is not
-            finite or show no motion; if a parameter to fit is zero; or if `kinds` has not one
-            number for each spring.
+            finite and at most `FARTHEST`, or show no motion; if a parameter to fit is zero; or if
+            `kinds` has not one number for each spring.
     """
     config = config or CalibrationConfig()
     _require_seconds("action_seconds", action_seconds)
@@ -312,60 +325,61 @@ def _time_step(body: Body, action_seconds: float, longest: float) -> tuple[float
 
 def _stack(body: Body, recordings: Sequence[Recording]) -> Recording:
     """Recordings stacked along a first axis, if they fit the body and each other."""
-    if not recordings:
-        raise ValueError("there are no recordings; give at least one")
-    shape = np.shape(recordings[0].actions.pick)
+    if not isinstance(recordings, Sequence) or not recordings:
+        raise ValueError(f"recordings is {told(recordings)}; give a list of at least one Recording")
+    shape: tuple[int | str, ...] = ("T", "G")
+    checked = []
     for index, recording in enumerate(recordings):
-        _check_recording(index, recording, body.num_particles, shape)
-    stacked = jax.tree.map(
-        lambda *leaves: jnp.stack([_as_array(leaf) for leaf in leaves]), *recordings
-    )
+        checked.append(_checked(index, recording, body.num_particles, shape))
+        shape = checked[0].actions.pick.shape
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *checked)
     if not np.any(np.asarray(stacked.positions != stacked.start.position[:, None])):
         raise ValueError("no particle moves in any recording; give a recording with motion")
     return stacked
 
 
-def _as_array(leaf: Any) -> Array:
-    kind = float if np.issubdtype(np.asarray(leaf).dtype, np.floating) else int
-    return jnp.asarray(leaf, dtype=kind)
+def _checked(index: int, recording: object, count: int, shape: tuple[int | str, ...]) -> Recording:
+    """A recording as arrays, with actions and pickers of a shape; its number for messages."""
+    if not isinstance(recording, Recording) or not isinstance(recording.start, State):
+        raise ValueError(
+            f"recording {index} is {told(recording)}; give Recording(State(position, velocity), "
+            f"Actions(pick, displacement), positions)"
+        )
+    why = f"for {count} particles and as many actions and pickers in every recording"
 
+    def reals(name: str, values: object, wanted: tuple[int | str, ...]) -> Array:
+        array = require_reals(f"{name} of recording {index}", values, wanted, why)
+        if not np.all(np.isfinite(array)):
+            raise ValueError(
+                f"recording {index} has a value that is not finite, in {name}; leave such moments "
+                f"out"
+            )
+        require_numbers(f"{name} of recording {index}", array, -FARTHEST, FARTHEST)
+        return jnp.asarray(array, dtype=float)
 
-def _check_recording(index: int, recording: Recording, count: int, shape: tuple[int, ...]) -> None:
-    expected = {
-        "start.position": (np.shape(recording.start.position), (count, 3)),
-        "start.velocity": (np.shape(recording.start.velocity), (count, 3)),
-        "actions.pick": (np.shape(recording.actions.pick), shape),
-        "actions.displacement": (np.shape(recording.actions.displacement), (*shape, 3)),
-        "positions": (np.shape(recording.positions), (*shape[:1], count, 3)),
-    }
-    for name, (found, wanted) in expected.items():
-        if found != wanted:
-            raise ValueError(
-                f"{name} of recording {index} has shape {found}; {wanted} is needed for "
-                f"{count} particles and as many actions and pickers in every recording"
-            )
-    for leaf in jax.tree.leaves(recording):
-        if not np.all(np.isfinite(np.asarray(leaf))):
-            raise ValueError(
-                f"recording {index} has a value that is not finite; leave such moments out"
-            )
+    pick = require_whole(f"actions.pick of recording {index}", recording.actions.pick)
+    require_shape(f"actions.pick of recording {index}", pick, shape, why)
+    start = State(
+        reals("start.position", recording.start.position, (count, 3)),
+        reals("start.velocity", recording.start.velocity, (count, 3)),
+        reals("start.missed", recording.start.missed, ()),
+    )
+    displacement = reals("actions.displacement", recording.actions.displacement, (*pick.shape, 3))
+    positions = reals("positions", recording.positions, (len(pick), count, 3))
     try:
-        require_actions(recording.actions, count)
+        actions = require_actions(Actions(jnp.asarray(pick), displacement), count)
     except ValueError as error:
         raise ValueError(f"recording {index}: {error}") from error
+    return Recording(start, actions, positions)
 
 
 def _check_kinds(body: Body, kinds: Int[np.ndarray, " S"] | None) -> Int[np.ndarray, " S"]:
     if kinds is None:
         values, kinds = np.unique(body.stiffness, return_inverse=True)
         return kinds if len(values) <= MOST_KINDS else np.zeros_like(kinds)
-    kinds, count = np.asarray(kinds), len(body.stiffness)
-    whole = np.issubdtype(kinds.dtype, np.integer)
-    if kinds.shape != (count,) or not whole or not np.all((kinds >= 0) & (kinds < count)):
-        raise ValueError(
-            f"kinds is an array of {kinds.dtype} of shape {kinds.shape}, its least value "
-            f"{kinds.min(initial=0)}; give one whole number from 0 for each of {count} springs"
-        )
+    count = len(body.stiffness)
+    kinds = require_ids("kinds", kinds, count, "springs")
+    require_shape("kinds", kinds, (count,), f"a whole number from 0 for each of {count} springs")
     return kinds
 
 

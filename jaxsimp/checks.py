@@ -25,7 +25,7 @@ def require_count(name: str, value: object, least: int, most: int = MOST) -> int
     whole = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
     if whole is None or not least <= whole <= most:
         limits = f"of at least {least}" if most == MOST else f"from {least} to {most}"
-        raise ValueError(f"{name} is {_told(value)}; give a whole number {limits}")
+        raise ValueError(f"{name} is {told(value)}; give a whole number {limits}")
     return whole
 
 
@@ -55,9 +55,7 @@ def require_number(
     """
     array = as_reals(value)
     if array is None or array.ndim or not lowest <= array <= highest:
-        raise ValueError(
-            f"{name} is {_told(value)}; give a number {_limits(lowest, highest, unit)}"
-        )
+        raise ValueError(f"{name} is {told(value)}; give a number {_limits(lowest, highest, unit)}")
     return float(array)
 
 
@@ -79,19 +77,19 @@ def require_numbers(
     array = as_reals(values)
     limits = _limits(lowest, highest, unit)
     if array is None:
-        raise ValueError(f"{name} is {_told(values)}; give an array of numbers {limits}")
+        raise ValueError(f"{name} is {told(values)}; give an array of numbers {limits}")
     wrong = np.argwhere(~((lowest <= array) & (array <= highest)))  # NaN, too
     if len(wrong):
         where = tuple(wrong[0].tolist())
-        told = f"{name}[{', '.join(map(str, where))}]" if where else name
-        raise ValueError(f"{told} is {array[where]:g}; give numbers {limits}")
+        which = f"{name}[{', '.join(map(str, where))}]" if where else name
+        raise ValueError(f"{which} is {array[where]:g}; give numbers {limits}")
     return array
 
 
 def require_choice(name: str, value: object, known: Collection[str]) -> None:
     """Raise a `ValueError` unless a value is one of the known names."""
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{name} is {_told(value)}; choose from {', '.join(known)}")
+        raise ValueError(f"{name} is {told(value)}; choose from {', '.join(known)}")
 
 
 def require_flag(name: str, value: object) -> None:
@@ -115,9 +113,12 @@ def require_ids(name: str, values: object, count: int, of: str = "particles") ->
     array = require_whole(name, values)
     wrong = array[(array < 0) | (array >= count)]
     if wrong.size and not count:
-        raise ValueError(f"{name} names {wrong[0]}, and there are no {of}; give them first")
+        raise ValueError(f"{name} names {wrong[0]}, and there are no {of}; give at least one first")
     if wrong.size:
-        raise ValueError(f"{name} names {wrong[0]}; the ids of {count} {of} are 0 to {count - 1}")
+        raise ValueError(
+            f"{name} names {wrong[0]}; the ids of {count} {of} are 0 to {count - 1}: give one of "
+            f"these"
+        )
     return array
 
 
@@ -128,12 +129,49 @@ def require_whole(name: str, values: object) -> np.ndarray:
         ValueError: if they are no array of whole numbers.
     """
     try:
-        array = np.asarray(values)
+        array = np.asarray(None if np.ma.is_masked(values) else values)
     except (ValueError, TypeError):
         array = np.asarray(None)
     if not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(f"{name} is {_told(values)}; give an array of whole numbers")
+        raise ValueError(f"{name} is {told(values)}; give an array of whole numbers")
     return array.astype(np.int64)
+
+
+def require_shape(name: str, array: np.ndarray, wanted: tuple[int | str, ...], why: str) -> None:
+    """Raise a `ValueError` unless an array has a shape.
+
+    Args:
+        name: name of the array, for the message.
+        array: what was given.
+        wanted: the shape; a letter for an axis of any length.
+        why: what the array has rows of, for the message.
+    """
+    fits = array.ndim == len(wanted) and all(
+        isinstance(axis, str) or axis == length
+        for axis, length in zip(wanted, array.shape, strict=True)
+    )
+    if not fits:
+        axes = ", ".join(map(str, wanted)) + "," * (len(wanted) == 1)
+        raise ValueError(f"{name} has shape {array.shape}; give shape ({axes}), {why}")
+
+
+def require_reals(name: str, values: object, wanted: tuple[int | str, ...], why: str) -> np.ndarray:
+    """Real numbers of a shape, finite or not, as an array of floats.
+
+    Args:
+        name: name of the array, for the message.
+        values: what was given.
+        wanted: its shape, as for `require_shape`.
+        why: what the array has rows of, for the message.
+
+    Raises:
+        ValueError: if the values are no real numbers, or the shape is another one.
+    """
+    array = as_reals(values)
+    if array is None:
+        raise ValueError(f"{name} is {told(values)}; give real numbers, {why}")
+    require_shape(name, array, wanted, why)
+    return array
 
 
 def require_rows(name: str, values: object, width: int, unit: str = "m") -> np.ndarray:
@@ -150,8 +188,8 @@ def require_rows(name: str, values: object, width: int, unit: str = "m") -> np.n
     """
     array = as_reals(values)
     if array is None or array.ndim != 2 or array.shape[1] != width:
-        told = _told(values) if array is None else f"an array of shape {array.shape}"
-        raise ValueError(f"{name} is {told}; give rows of {width} real numbers, in {unit}")
+        given = told(values) if array is None else f"an array of shape {array.shape}"
+        raise ValueError(f"{name} is {given}; give rows of {width} real numbers, in {unit}")
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise ValueError(
@@ -162,21 +200,25 @@ def require_rows(name: str, values: object, width: int, unit: str = "m") -> np.n
 
 
 def as_reals(values: object) -> np.ndarray | None:
-    """Values as an array of floats; None if they are no real numbers, or no rectangular array."""
+    """Values as an array of floats; None if they are no real numbers, or no rectangular array.
+
+    A value that is masked is NaN: it is not known.
+    """
     try:
-        array = np.asarray(values)
+        array = np.asanyarray(values)
     except (ValueError, TypeError):
         return None
     if not (np.issubdtype(array.dtype, np.floating) or np.issubdtype(array.dtype, np.integer)):
         return None
-    return array.astype(float)
+    floats = array.astype(float)
+    return np.asarray(np.ma.filled(floats, np.nan) if np.ma.is_masked(array) else floats)
 
 
 def _limits(lowest: float, highest: float, unit: str) -> str:
     return f"from {lowest:g} to {highest:g}{' ' * bool(unit)}{unit}"
 
 
-def _told(value: Any) -> str:
+def told(value: Any) -> str:
     """A value as a short text: an array by its type and shape."""
     if isinstance(value, np.ndarray) and value.ndim:
         return f"an array of {value.dtype}, shape {value.shape}"

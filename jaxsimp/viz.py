@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.topology import boundary_edges
+from jaxsimp.checks import require_reals
 from jaxsimp.dynamics import Obstacle, Table
 from jaxsimp.simplification import FitStatus, KeyPoints
 
@@ -77,6 +78,7 @@ def plot_costs(
         costs: costs by task, then method, shape (R, I): one row per run, one column per iteration.
         ylabel: label of the cost axis.
     """
+    costs = _arrays("costs", costs, ("R", "I"), "a row of costs by iteration for each run")
     figure, panels = _panels(costs)
     for axes, (name, methods) in zip(panels, costs.items(), strict=True):
         for index, (method, runs) in enumerate(methods.items()):
@@ -109,10 +111,11 @@ def plot_scores(
         ylabel: label of the second score.
         success: least score of a success, drawn as a dashed line.
     """
+    scores = _arrays("scores", scores, ("R", 2), "the two scores of a plan in each row")
     figure, panels = _panels(scores)
     for axes, (name, methods) in zip(panels, scores.items(), strict=True):
         shown = np.concatenate([np.array([[success, success]]), *methods.values()])
-        low = min(0.0, float(np.nanmin(shown))) - 0.05
+        low = min(0.0, float(shown[np.isfinite(shown)].min(initial=0.0))) - 0.05
         axes.plot([low, 1.05], [low, 1.05], color=GOAL_COLOR, lw=0.8)
         axes.axhline(success, color=GOAL_COLOR, ls="--", lw=0.8)
         for index, (method, pairs) in enumerate(methods.items()):
@@ -156,6 +159,21 @@ def plot_executions(
     import matplotlib.pyplot as plt
 
     _require_some(executions)
+    wanted, why = (
+        ("P", *body.rest.shape),
+        "positions of the body at the start and after each action",
+    )
+    goal = require_reals("the goal", goal, wanted[1:], "one row of x, y, z for each particle")
+    executions = {
+        method: (require_reals(f"the positions of {method}", frames, wanted, why), score)
+        for method, (frames, score) in executions.items()
+    }
+    for method, (moved, _) in executions.items():
+        if len(moved) < 2:
+            raise ValueError(
+                f"the positions of {method} are {len(moved)} rows; give at least 2, at the start "
+                f"and settled"
+            )
     columns = max(len(positions) for positions, _ in executions.values()) + 1
     figure, grid = plt.subplots(
         len(executions),
@@ -174,7 +192,9 @@ def plot_executions(
             f"settled, score {value:.2f}",
             "goal",
         ]
-        for axes, frame, name in zip(row, frames, names, strict=True):
+        for unused in row[len(frames) :]:  # of a plan with fewer actions than another
+            unused.remove()
+        for axes, frame, name in zip(row[: len(frames)], frames, names, strict=True):
             draw_body(axes, body, frame, GOAL_COLOR if name == "goal" else COLORS[0])
             _frame(axes, every)
             for obstacle in obstacles:
@@ -259,6 +279,7 @@ def _surface(
 
 def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -> None:
     """A model over its goal, into 3-D axes."""
+    goal = require_reals("the goal", goal, body.rest.shape, "one row of x, y, z for each particle")
     axes.computed_zorder = False  # key points lie in the goal: depth order would hide some
     draw_body(axes, body, goal, GOAL_COLOR)
     closed = model.elements[:, [*range(model.elements.shape[1]), 0]]
@@ -299,9 +320,11 @@ def _frame(axes: "Axes3D", shown: Sequence[Positions], zoom: float = 1.1) -> Non
     """Set equal scales around all positions, a view from above at an angle, and no axes."""
     points = np.concatenate(shown)
     points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        points = np.zeros((1, 3))  # of failed motions, of which nothing is drawn
     low, high = points.min(axis=0), points.max(axis=0)
     low[2], high[2] = min(low[2], 0.0), max(high[2], 1e-3)
-    span = np.maximum(high - low, 0.05 * np.ptp(points))
+    span = np.maximum(high - low, 0.05 * np.ptp(points) or 1.0)
     middle = (low + high) / 2
     axes.set(
         xlim=(middle[0] - span[0] / 2, middle[0] + span[0] / 2),
@@ -334,6 +357,19 @@ def _panels(items: Mapping[str, object], *, three_d: bool = False) -> tuple["Fig
     for unused in panels[len(items) :]:
         unused.remove()
     return figure, panels[: len(items)]
+
+
+def _arrays(
+    what: str, groups: Mapping[str, Mapping[str, Any]], shape: tuple[int | str, ...], why: str
+) -> dict[str, dict[str, np.ndarray]]:
+    """Numbers by task and method, as arrays of a shape."""
+    return {
+        task: {
+            method: require_reals(f"{what} of {task}, {method}", values, shape, why)
+            for method, values in methods.items()
+        }
+        for task, methods in groups.items()
+    }
 
 
 def _require_some(items: Mapping[str, object]) -> None:

@@ -226,7 +226,10 @@ def bad_recordings() -> dict[str, tuple[Recording, str]]:
     ok = good()
     one_more = Actions(jnp.full((3, 1), 0), jnp.full((3, 1, 3), 0.01))
     return {
-        "particles": (replace(ok, positions=jnp.ones((2, 5, 3))), r"\(2, 5, 3\); \(2, 6, 3\)"),
+        "particles": (
+            replace(ok, positions=jnp.ones((2, 5, 3))),
+            r"\(2, 5, 3\); give shape \(2, 6, 3\)",
+        ),
         "frames": (replace(ok, positions=jnp.ones((3, 6, 3))), r"positions .* \(2, 6, 3\)"),
         "actions": (replace(ok, actions=one_more), r"actions.pick of recording 1 .* \(2, 1\)"),
         "displacements": (
@@ -237,6 +240,11 @@ def bad_recordings() -> dict[str, tuple[Recording, str]]:
             replace(ok, start=State(jnp.ones((5, 3)), jnp.ones((5, 3)))),
             r"start.position .* \(6, 3\)",
         ),
+        "far": (
+            replace(ok, start=State(jnp.full((6, 3), 1e29), jnp.zeros((6, 3)))),
+            r"start.position of recording 1\[0, 0\] is 1e\+29; give numbers from -1e\+06",
+        ),
+        "none": (None, r"recording 1 is None; give Recording\(State"),
         "not finite": (
             replace(ok, positions=ok.positions.at[1, 2, 0].set(jnp.nan)),
             "recording 1 has a value that is not finite",
@@ -246,7 +254,8 @@ def bad_recordings() -> dict[str, tuple[Recording, str]]:
 
 @pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize(
-    "name", ["particles", "frames", "actions", "displacements", "start", "not finite"]
+    "name",
+    ["particles", "frames", "actions", "displacements", "start", "far", "none", "not finite"],
 )
 def test_recordings_that_do_not_fit_are_refused(name):
     recording, message = bad_recordings()[name]
@@ -257,7 +266,7 @@ def test_recordings_that_do_not_fit_are_refused(name):
 
 
 def test_recordings_that_say_nothing_are_refused():
-    with pytest.raises(ValueError, match="no recordings"):
+    with pytest.raises(ValueError, match=r"recordings is \[\]; give a list of at least one"):
         calibrate(ROPE, [], SECONDS)
     start = at_rest(goals.flat(ROPE))
     still = replace(good(), positions=jnp.stack([start.position] * 2))
@@ -288,16 +297,22 @@ def test_the_material_of_a_calibrated_body_makes_that_body():
 def test_what_cannot_be_fitted_is_refused():
     with pytest.raises(ValueError, match="drag of the body is 0"):
         calibrate(ROPE.scaled(drag=0.0), [good()], SECONDS)
-    for kinds in (np.zeros(3, dtype=int), np.full(9, -1)):
-        with pytest.raises(ValueError, match="from 0 for each of 9 springs"):
+    for kinds, message in (
+        (np.zeros(3, dtype=int), r"kinds has shape \(3,\); give shape \(9,\)"),
+        (np.full(9, -1), "kinds names -1; the ids of 9 springs are 0 to 8"),
+    ):
+        with pytest.raises(ValueError, match=message):
             calibrate(ROPE, [good()], SECONDS, kinds=kinds)
 
 
+@pytest.mark.usefixtures("unchecked_shapes")
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"parameters": ("mass",)}, r"choose from stiffness, damping, drag, friction"),
-        ({"parameters": ()}, "choose from"),
+        ({"parameters": ()}, r"parameters is \(\); give a tuple of names, of stiffness"),
+        ({"parameters": np.array(5)}, r"parameters is array\(5\); give a tuple of names"),
+        ({"parameters": ("drag", [])}, r"a name in parameters is \[\]; choose from stiffness"),
         ({"steps": 0}, "steps is 0"),
         ({"learning_rate": 0.0}, "learning_rate is 0"),
         ({"learning_rate": float("nan")}, "learning_rate is nan"),

@@ -13,7 +13,9 @@ from jaxsimp.checks import (
     require_ids,
     require_number,
     require_numbers,
+    require_reals,
     require_rows,
+    require_shape,
     require_whole,
 )
 
@@ -75,10 +77,10 @@ def test_ids_of_any_whole_type_and_shape_are_int64(values):
 @pytest.mark.parametrize(
     ("values", "count", "message"),
     [
-        ([0, 3], 3, "faces names 3; the ids of 3 points are 0 to 2"),
+        ([0, 3], 3, "faces names 3; the ids of 3 points are 0 to 2: give one of"),
         ([-1], 3, "faces names -1; the ids of 3 points"),
         ([2**40], 3, "faces names 1099511627776"),
-        ([0], 0, "faces names 0, and there are no points; give them first"),
+        ([0], 0, "faces names 0, and there are no points; give at least one first"),
         ([0.0], 3, r"faces is \[0.0\]; give an array of whole numbers"),
         ([True], 3, r"faces is \[True\]; give an array of whole"),
         ([[0], [1, 2]], 3, "faces is .*; give an array of whole"),
@@ -112,3 +114,41 @@ def test_rows_are_finite_numbers_of_one_width(values, message):
     np.testing.assert_array_equal(require_rows("points", [[1, 2, 3]], 3), [[1.0, 2.0, 3.0]])
     with pytest.raises(ValueError, match=message):
         require_rows("points", values, 3)
+
+
+def test_an_array_of_another_shape_is_refused_with_the_shape_to_give():
+    why = "one row for each particle"
+    require_shape("rest", np.zeros((5, 3)), ("N", 3), why)
+    require_shape("mass", np.zeros(5), (5,), why)
+    for wanted, message in (
+        ((5, 2), r"rest has shape \(5, 3\); give shape \(5, 2\), one row for each particle"),
+        (("N", 2), r"give shape \(N, 2\)"),
+        ((5,), r"give shape \(5,\)"),
+        ((), r"give shape \(\)"),
+        (("B", 5, 3), r"give shape \(B, 5, 3\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            require_shape("rest", np.zeros((5, 3)), wanted, why)
+
+
+def test_real_numbers_of_a_shape_are_floats_finite_or_not():
+    found = require_reals("goal", [[1, 2, math.nan]], ("N", 3), "a row of x, y, z")
+    np.testing.assert_array_equal(found, [[1.0, 2.0, math.nan]])
+    assert found.dtype == float
+    for values, message in (
+        ([[1], [1, 2]], r"goal is \[\[1\], \[1, 2\]\]; give real numbers, a row of x, y, z"),
+        ([[True] * 3], r"goal is \[\[True, True, True\]\]; give real"),
+        ([1, 2, 3], r"goal has shape \(3,\); give shape \(N, 3\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            require_reals("goal", values, ("N", 3), "a row of x, y, z")
+
+
+def test_a_masked_value_is_not_known():
+    masked = np.ma.masked_array([[1.0, 2.0]], [[False, True]])
+    with pytest.raises(ValueError, match=r"mass\[0, 1\] is nan; give numbers from 0 to 9 kg"):
+        require_numbers("mass", masked, 0.0, 9.0, "kg")
+    with pytest.raises(ValueError, match=r"faces is .*; give an array of whole numbers"):
+        require_whole("faces", np.ma.masked_array([1, 2], [False, True]))
+    whole = np.ma.masked_array([[1.0, 2.0]])
+    assert type(require_numbers("mass", whole, 0.0, 9.0)) is np.ndarray

@@ -315,3 +315,51 @@ def test_importing_viz_does_not_import_matplotlib():
 def test_nothing_to_draw_is_refused(draw):
     with pytest.raises(ValueError, match="nothing to draw; give at least one entry"):
         draw({})
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda: viz.plot_costs({"a": {"m": 1j}}), "costs of a, m is 1j; give real numbers, a row"),
+        (
+            lambda: viz.plot_scores({"a": {"m": np.ones(3)}}, "ours", "theirs", 0.9),
+            r"scores of a, m has shape \(3,\); give shape \(R, 2\), the two scores",
+        ),
+        (
+            lambda: viz.plot_models({"a": (rope(9), np.ones((9, 2)), rope_model())}),
+            r"the goal has shape \(9, 2\); give shape \(9, 3\)",
+        ),
+        (
+            lambda: viz.plot_executions(rope(5), rope(5).rest, {"m": (1.0, 0.5)}, "title"),
+            r"positions of m has shape \(\); give shape \(P, 5, 3\)",
+        ),
+        (
+            lambda: viz.plot_executions(rope(5), rope(5).rest, {"m": ([rope(5).rest], 0.5)}, "t"),
+            "positions of m are 1 rows; give at least 2, at the start and settled",
+        ),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(draw, message):
+    with pytest.raises(ValueError, match=message):
+        draw()
+
+
+def test_plans_of_different_lengths_have_a_frame_for_each_action():
+    body = rope(5)
+    frames = np.stack([body.rest] * 4)
+    figure = viz.plot_executions(body, body.rest, {"a": (frames, 0.5), "b": (frames[:3], 0.5)}, "t")
+    assert [axes.get_title() for axes in figure.axes][5:] == [
+        "start", "action 1", "settled, score 0.50", "goal",
+    ]  # fmt: skip
+
+
+def test_a_goal_at_one_place_is_drawn():
+    figure = viz.plot_simplifications({"a": (rope(9), np.zeros((9, 3)), rope_model())})
+    figure.canvas.draw()
+
+
+def test_scores_that_are_not_finite_are_left_out_of_the_limits():
+    pairs = np.array([[0.9, -np.inf], [0.5, np.nan], [-0.2, 0.3]])
+    figure = viz.plot_scores({"a": {"m": pairs}}, "ours", "theirs", 0.9)
+    assert figure.axes[0].get_xlim() == pytest.approx((-0.25, 1.05))

@@ -17,7 +17,14 @@ from jaxtyping import Float, Int
 from jaxsimp.bodies.material import FACTORS, FAMILIES, Material, refuse_unknown
 from jaxsimp.bodies.size import LARGEST, MOST_PARTICLES, require_size
 from jaxsimp.bodies.topology import distinct_edges
-from jaxsimp.checks import as_reals, require_count, require_ids, require_numbers, require_whole
+from jaxsimp.checks import (
+    as_reals,
+    require_count,
+    require_ids,
+    require_numbers,
+    require_shape,
+    require_whole,
+)
 
 _FLOATS: dict[str, tuple[float, float, str]] = {
     "rest": (-10 * LARGEST, 10 * LARGEST, "m"),
@@ -54,10 +61,10 @@ class Body:
             `(N,)` for a body without a grid, as a rope or a mesh.
 
     Raises:
-        ValueError: if an array has the wrong shape or a value out of range, if there are no
-            particles or more than `MOST_PARTICLES`, if the extent is outside `SMALLEST` to
-            `LARGEST` (see `jaxsimp.bodies.size`), or if a spring joins a particle to itself or a
-            pair already joined.
+        ValueError: if the name is no text, an array has the wrong shape or a value out of range, if
+            there are no particles or more than `MOST_PARTICLES`, if the extent is outside
+            `SMALLEST` to `LARGEST` (see `jaxsimp.bodies.size`), or if a spring joins a particle to
+            itself or a pair already joined.
     """
 
     name: str
@@ -73,6 +80,8 @@ class Body:
     shape: tuple[int, ...]
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise ValueError(f"name is {self.name!r}; give a text, such as 'shirt'")
         if not isinstance(self.material, Material):
             raise ValueError(f"material is {self.material!r}; give a jaxsimp.Material")
         for name in (*_FLOATS, "springs", "families", "faces"):
@@ -126,6 +135,7 @@ class Body:
             ValueError: if a product is out of the parameter's range.
         """
         refuse_unknown(factors, FACTORS)
+        require_numbers("stiffness", stiffness, 0.0, 1e12)
         if np.ndim(stiffness) and np.shape(stiffness) != self.stiffness.shape:
             raise ValueError(
                 f"stiffness has shape {np.shape(stiffness)}; give one factor, or one for each of "
@@ -160,28 +170,21 @@ def _own(name: str, values: Any) -> np.ndarray:
 
 
 def _check_shapes(body: Body) -> None:
-    for name in ("rest", "springs", "faces"):
-        if not getattr(body, name).ndim:
-            raise ValueError(f"{name} is a single number; give an array, one row for each")
+    for name, letter, width in (("rest", "N", 3), ("springs", "S", 2), ("faces", "F", 3)):
+        require_shape(name, getattr(body, name), (letter, width), "one row for each")
     count, num_springs = len(body.rest), len(body.springs)
     require_count("num_particles", count, 1, MOST_PARTICLES)
-    expected = {
-        "rest": (count, 3),
+    expected: dict[str, tuple[int, ...]] = {
         "mass": (count,),
-        "springs": (num_springs, 2),
         "families": (num_springs,),
         "rest_length": (num_springs,),
         "stiffness": (num_springs,),
         "damping": (num_springs,),
-        "faces": (len(body.faces), 3),
     }
     for name, shape in expected.items():
         array = getattr(body, name)
-        if array.shape != shape:
-            raise ValueError(
-                f"{name} has shape {array.shape}; {shape} is needed: the body has {count} "
-                f"particles, the rows of rest, and {num_springs} springs"
-            )
+        why = f"for {count} particles, the rows of rest, and {num_springs} springs"
+        require_shape(name, array, shape, why)
 
 
 def _check_ids(body: Body) -> None:

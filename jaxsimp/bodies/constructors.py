@@ -3,7 +3,7 @@
 Each takes a material, by default that of its kind in `MATERIALS`, and changes of single parameters.
 """
 
-from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -182,8 +182,8 @@ def from_mesh(
     )
 
 
-def _two(name: str, values: object) -> tuple[object, object]:
-    both = tuple(values) if isinstance(values, Iterable) else ()
+def _two(name: str, values: Any) -> tuple[object, object]:
+    both = tuple(values) if np.iterable(values) else ()
     if len(both) != 2:
         raise ValueError(f"{name} is {values!r}; give two numbers, along x and along y")
     return both

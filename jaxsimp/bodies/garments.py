@@ -339,4 +339,4 @@ def _require(**dimensions: float) -> None:
 
 def _require_less(name: str, value: float, limit_name: str, limit: float) -> None:
     if not value < limit:
-        raise ValueError(f"{name} is {value:.4g} m; it must be below {limit_name}, {limit:.4g} m")
+        raise ValueError(f"{name} is {value:.4g} m; make it less than {limit_name}, {limit:.4g} m")

@@ -23,7 +23,7 @@ from jaxsimp.bodies.topology import (
     inner_edges,
     shared_half_edges,
 )
-from jaxsimp.checks import as_reals, require_choice, require_ids, require_whole
+from jaxsimp.checks import require_choice, require_ids, require_reals, require_shape, require_whole
 
 Points = Float[np.ndarray, "V 3"]
 Mesh = tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]
@@ -75,13 +75,9 @@ def as_mesh(points: object, faces: object) -> Mesh:
         ValueError: if an array has another shape or type, or there are more than `MOST_PARTICLES`
             points or `MOST_TRIANGLES` triangles.
     """
-    coordinates = as_reals(points)
-    if coordinates is None:
-        raise ValueError("points holds no real numbers; give a row of x, y, z for each point")
+    coordinates = require_reals("points", points, ("V", 3), "a row of x, y, z for each point")
     ids = require_whole("faces", faces)
-    for name, array in (("points", coordinates), ("faces", ids)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name} has shape {array.shape}; a row of three is needed for each")
+    require_shape("faces", ids, ("F", 3), "a row of three points for each triangle")
     for name, count, most in (
         ("points", len(coordinates), MOST_PARTICLES),
         ("triangles", len(ids), MOST_TRIANGLES),
@@ -175,7 +171,7 @@ def _distinct_ids(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     if not len(faces):
-        raise ValueError("every triangle names a point twice; give a surface")
+        raise ValueError(f"each of {len(a)} triangles names a point twice; give a surface")
     return faces
 
 

@@ -64,7 +64,7 @@ def mesh_symmetric_outline(
     on_line = half[:, 0] == 0
     if not (on_line[0] and on_line[-1]) or on_line[1:-1].any() or (half[:, 0] < 0).any():
         raise ValueError(
-            f"the half outline has x from {half[:, 0].min():g} m; it must begin and end at "
+            f"the half outline has x from {half[:, 0].min():g} m; let it begin and end at "
             f"x = 0, with x above zero between"
         )
     half = check_outline(half)

@@ -7,7 +7,6 @@ import math
 import sys
 import time
 import warnings
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -88,6 +87,7 @@ class Options:
         """
         from jaxsimp.bodies.size import LARGEST, require_scale
         from jaxsimp.checks import require_choice, require_number
+        from jaxsimp.records.files import require_path
         from jaxsimp.simplification.key_points import SMALLEST_TOLERANCE
 
         if not self.goals:
@@ -102,8 +102,7 @@ class Options:
         for name, path in (("--json", self.json), ("--figure", self.figure)):
             if path is None:
                 continue
-            with suppress(FileNotFoundError):
-                path.stat()  # raises for a name that no file can have; is_dir since 3.14 does not
+            require_path(path, f"give another {name}")
             if path.is_dir():
                 raise ValueError(f"{path} is a folder; give a file with {name}")
             if not path.parent.is_dir():

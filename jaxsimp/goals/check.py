@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.size import LARGEST, unit_of
-from jaxsimp.checks import as_reals
+from jaxsimp.checks import require_reals
 from jaxsimp.goals.shapes import Positions
 
 NOISE = 0.03
@@ -32,14 +32,8 @@ def as_goal(body: Body, goal: Positions) -> Positions:
             extent is beyond that of a stretched body, or the body is torn or squeezed to nothing
             (see `TORN`, `SQUEEZED`).
     """
-    positions = as_reals(goal)
-    if positions is None:
-        raise ValueError("the goal holds no real numbers; give a row of x, y, z, in metres, each")
-    if positions.shape != body.rest.shape:
-        raise ValueError(
-            f"the goal has shape {positions.shape}; {body.rest.shape} is needed, "
-            f"one row of x, y, z for each particle of the {body.name}"
-        )
+    why = f"one row of x, y, z for each particle of the {body.name}"
+    positions = require_reals("the goal", goal, body.rest.shape, why)
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
     if bad.size:
         raise ValueError(

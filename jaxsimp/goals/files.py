@@ -13,7 +13,7 @@ from jaxsimp.bodies import MATERIALS, Body, from_mesh, rope_along
 from jaxsimp.bodies.mesh_files import load_mesh, read_file, read_mesh
 from jaxsimp.bodies.meshes import z_up
 from jaxsimp.bodies.size import MOST_TRIANGLES, require_scale, require_size
-from jaxsimp.checks import require_whole
+from jaxsimp.checks import require_shape, require_whole
 from jaxsimp.goals.check import MAX_STRETCH, NOISE, check_goal
 from jaxsimp.goals.flatten import flatten
 from jaxsimp.goals.shapes import Positions
@@ -224,8 +224,7 @@ def _body_of(positions: np.ndarray, arrays: dict[str, np.ndarray]) -> Body:
 
 def _rows_of_three(name: str, array: np.ndarray) -> np.ndarray:
     """Coordinates as floats."""
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"{name} has shape {array.shape}; one row of x, y, z a particle is needed")
+    require_shape(name, array, ("N", 3), "one row of x, y, z for each particle")
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
     if bad.size:
         raise ValueError(

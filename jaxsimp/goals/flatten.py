@@ -20,7 +20,7 @@ from jaxsimp.bodies.topology import (
     half_edges,
     inner_edges,
 )
-from jaxsimp.checks import require_ids
+from jaxsimp.checks import require_ids, require_shape
 from jaxsimp.goals.shapes import Positions
 
 SCALES = (1.0, 0.3, 0.1)
@@ -110,11 +110,16 @@ def _check_extent(positions: np.ndarray) -> None:
 
 def _check_ids(faces: np.ndarray, num_points: int) -> None:
     """Raise a `ValueError` for triangles with wrong shape, unknown points, or a point twice."""
-    if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
-        raise ValueError(f"faces has shape {faces.shape}; a row of three is needed for each")
+    require_shape("faces", faces, ("F", 3), "a row of three points for each triangle")
+    if not len(faces):
+        raise ValueError("there are no faces; give at least one triangle")
     require_ids("a triangle", faces, num_points, "points")
-    if (np.diff(np.sort(faces, axis=1), axis=1) == 0).any():
-        raise ValueError("a triangle names a point twice; leave it out of faces")
+    twice = np.flatnonzero((np.diff(np.sort(faces, axis=1), axis=1) == 0).any(axis=1))
+    if twice.size:
+        raise ValueError(
+            f"triangle {twice[0]} names a point twice ({twice.size} such triangles); leave it out "
+            f"of faces"
+        )
 
 
 def _scaled_distances(

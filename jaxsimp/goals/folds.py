@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.garments import Garment
 from jaxsimp.bodies.topology import boundary_edges, half_edges
-from jaxsimp.checks import as_reals, require_rows
+from jaxsimp.checks import as_reals, require_choice, require_rows, require_shape, told
 from jaxsimp.goals.shapes import Positions, flat, require_flat
 
 
@@ -39,12 +39,22 @@ def fold_sequence(
         positions: positions before the folds, shape (N, 3), metres; the body flat by default.
 
     Raises:
-        ValueError: if a fold is invalid (see `fold`).
+        ValueError: if a fold is no `Fold`, or invalid (see `fold`).
     """
     positions = flat(body) if positions is None else positions
-    for one in folds:
+    for one in _require_folds(folds):
         positions = fold(body, positions, one.point, one.direction, part=one.part)
     return positions
+
+
+def _require_folds(folds: Iterable[Fold]) -> list[Fold]:
+    if not np.iterable(folds):
+        raise ValueError(f"folds is {told(folds)}; give a list of Fold(point, direction)")
+    listed = list(folds)
+    for one in listed:
+        if not isinstance(one, Fold):
+            raise ValueError(f"a fold is {told(one)}; give a list of Fold(point, direction)")
+    return listed
 
 
 def fold(
@@ -100,19 +110,15 @@ def _two(name: str, values: object) -> np.ndarray:
     """Finite x and y."""
     reals = as_reals(values)
     if reals is None or reals.shape != (2,) or not np.isfinite(reals).all():
-        told = values.tolist() if isinstance(values, np.ndarray) else values
-        raise ValueError(f"{name} is {told}; give finite coordinates x and y, in metres")
+        given = values.tolist() if isinstance(values, np.ndarray) else values
+        raise ValueError(f"{name} is {given}; give finite coordinates x and y, in metres")
     return reals
 
 
 def _check_positions(body: Body, positions: object) -> np.ndarray:
     """Positions of the body that can be folded: it lies flat at rest, or lower than at rest."""
-    rows, count = require_rows("positions", positions, 3), body.num_particles
-    if len(rows) != count:
-        raise ValueError(
-            f"positions has {len(rows)} rows; give one for each of {count} particles of the "
-            f"{body.name}"
-        )
+    rows = require_rows("positions", positions, 3)
+    require_shape("positions", rows, body.rest.shape, f"one row for each particle of {body.name}")
     if np.ptp(rows[:, 2]) > np.ptp(body.rest[:, 2]) / 2:
         require_flat(body)
     return rows
@@ -145,6 +151,7 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
     Raises:
         ValueError: if the name is unknown, or the cloth is not square for "four_corners".
     """
+    require_choice("fold", name, ("side", "diagonal", "quarter", "letter", "four_corners"))
     x, y = np.ptp(body.rest[:, :2], axis=0) / 2
     side = _fold_about((0.0, 0.0), (0.0, 1.0))
     if name == "side":
@@ -155,18 +162,16 @@ def rectangle_folds(body: Body, name: str) -> tuple[Fold, ...]:
         return side, _fold_about((0.0, 0.0), (1.0, 0.0))
     if name == "letter":
         return _fold_about((-x / 3, 0.0), (0.0, 1.0)), _fold_about((x / 3, 0.0), (0.0, -1.0))
-    if name == "four_corners":
-        if not np.isclose(x, y, rtol=0.01):
-            raise ValueError(
-                f"the {body.name} is {2 * x:.4g} m by {2 * y:.4g} m; only the corners of a "
-                f"square are folded to the centre"
-            )
-        # The corner lies to the left of the line through the middles of its sides.
-        return tuple(
-            _fold_about((a * x / 2, b * y / 2), (b, -a))
-            for a, b in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    if not np.isclose(x, y, rtol=0.01):
+        raise ValueError(
+            f"the {body.name} is {2 * x:.4g} m by {2 * y:.4g} m; only the corners of a square are "
+            f"folded to the centre: choose other folds"
         )
-    raise ValueError(f"fold is {name!r}; choose from side, diagonal, quarter, letter, four_corners")
+    # The corner lies to the left of the line through the middles of its sides.
+    return tuple(
+        _fold_about((a * x / 2, b * y / 2), (b, -a))
+        for a, b in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    )
 
 
 def sleeves_in(shirt: Garment) -> tuple[Fold, Fold]:

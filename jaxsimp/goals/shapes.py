@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.size import LARGEST
-from jaxsimp.checks import require_choice, require_number, require_rows
+from jaxsimp.checks import require_choice, require_number, require_rows, require_shape
 
 Positions = Float[np.ndarray, "N 3"]
 BUMPS = 0.05
@@ -78,10 +78,12 @@ def polyline(body: Body, corners: Float[np.ndarray, "M 2"]) -> Positions:
     require_rope(body)
     corners = require_rows("corners", corners, 2)
     if len(corners) < 2:
-        raise ValueError(f"corners has shape {corners.shape}; (M, 2) with M of 2 or more is needed")
+        raise ValueError(f"corners has {len(corners)} rows; give at least 2, of x and y")
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     if not 0 < arc[-1] < np.inf:
-        raise ValueError(f"the polyline is {arc[-1]:g} m long; give corners that are apart")
+        raise ValueError(
+            f"the polyline is {arc[-1]:g} m long; give at least two corners that are apart"
+        )
     along = np.linspace(0.0, arc[-1], body.num_particles)
     xy = [np.interp(along, arc, corners[:, axis]) for axis in range(2)]
     return np.stack([*xy, np.full(body.num_particles, body.radius)], axis=1)
@@ -150,10 +152,11 @@ def lift_crossings(body: Body, positions: Positions) -> Positions:
         positions: shape (N, 3), metres.
 
     Raises:
-        ValueError: if the body is no rope.
+        ValueError: if the body is no rope, or the positions are not those of its particles.
     """
     require_rope(body)
     positions = require_rows("positions", positions, 3)
+    require_shape("positions", positions, body.rest.shape, "one row for each particle of the rope")
     lifted = positions.copy()
     index = np.arange(len(positions))
     steps = np.diff(positions[:, :2], axis=0)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from jaxsimp.records.files import PART, remove_parts, write_json
+from jaxsimp.records.files import PART, remove_parts, require_path, write_json
 from jaxsimp.records.lock import HOLDER_FILE, LOCK_FILE, ResultsError, lock_folder, not_writable
 
 CONFIG_FILE = "config.json"
@@ -24,6 +24,7 @@ def open_folder(folder: Path, config: Mapping[str, Any]) -> Iterator[None]:
             or was made with another configuration. No file of the folder is changed then.
     """
     wanted = json.loads(json.dumps(config))
+    require_path(folder, "give another folder with --out")
     _require_ours(folder, wanted)  # before the lock, which is a file
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,12 @@
 """Methods of simplification by name, and the functions that call them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body
-from jaxsimp.checks import require_choice
+from jaxsimp.checks import as_reals, require_choice, require_shape, told
 from jaxsimp.goals import Positions, as_goal
 from jaxsimp.simplification.key_points import FitStatus, KeyPoints
 from jaxsimp.simplification.ropes.fit import Workspace, why_infeasible
@@ -52,15 +54,10 @@ def simplify_batch(
             range, or a workspace is given for a surface.
     """
     require_choice("method", method, METHODS)
-    if np.ndim(goals) == 2:
-        raise ValueError(
-            f"goals has shape {np.shape(goals)}; give a batch, shape (B, N, 3), or call simplify "
-            f"with one goal"
-        )
-    checked = [as_goal(body, goal) for goal in goals]
+    checked = [as_goal(body, goal) for goal in _each(body, goals)]
     simplify_ropes, simplify_surfaces = METHODS[method]
     if workspace is not None and not isinstance(workspace, Workspace):
-        raise ValueError(f"workspace is {workspace!r}; give a jaxsimp.Workspace")
+        raise ValueError(f"workspace is {told(workspace)}; give a jaxsimp.Workspace")
     if workspace is not None and len(body.faces):
         raise ValueError(
             f"a workspace (lower, upper, above_table, fixed_ends, max_stretch) is given, and "
@@ -72,6 +69,17 @@ def simplify_batch(
     if len(body.faces):
         return simplify_surfaces(body, np.stack(checked), tolerance, max_size)
     return simplify_ropes(body, np.stack(checked), tolerance, max_size, workspace=workspace)
+
+
+def _each(body: Body, goals: Sequence[Positions] | np.ndarray) -> list[Positions]:
+    """The goals of a batch: an array, or a list of goals."""
+    array = as_reals(goals)  # None for goals of several shapes, which `as_goal` names
+    if array is not None and array.size:
+        wanted = ("B", *body.rest.shape)
+        require_shape("goals", array, wanted, "a batch, or call simplify with one goal")
+    elif not isinstance(goals, np.ndarray | Sequence) or isinstance(goals, str | bytes):
+        raise ValueError(f"goals is {told(goals)}; give an array of shape (B, N, 3)")
+    return list(goals)
 
 
 def simplify(
@@ -106,6 +114,6 @@ def simplify(
         raise ValueError(
             f"no model of up to {points.sizes[-1]} key points is within the tolerance of "
             f"{points.tolerance:.3g} m: the best is off by {min(points.errors):.3g} m; raise "
-            f"tolerance or max_size"
+            f"tolerance, or max_size above {points.sizes[-1]}"
         )
     return points

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsimp.checks import require_shape
+
 
 class SolverStatus(IntEnum):
     """Result of one problem; `NOT_CONVERGED` includes problems without a lower bound."""
@@ -290,8 +292,8 @@ def _check_shapes(problem: QuadraticProgram) -> None:
     }
     for name, shape in expected.items():
         array = getattr(problem, name)
-        if array is not None and array.shape != shape:
-            raise ValueError(f"{name} has shape {array.shape}; {shape} is needed")
+        if array is not None:
+            require_shape(name, array, shape, f"as g has shape {problem.g.shape}")
 
 
 def _check_numbers(problem: QuadraticProgram) -> None:

@@ -406,16 +406,19 @@ def test_a_cloth_refuses(arguments, message):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"rest": np.zeros((3, 2))}, r"rest has shape \(3, 2\); \(3, 3\) is needed"),
+        ({"rest": np.zeros((3, 2))}, r"rest has shape \(3, 2\); give shape \(N, 3\)"),
         ({"rest": np.zeros((0, 3))}, "num_particles is 0; give a whole number from 1"),
         ({"rest": np.full((3, 3), NAN)}, r"rest\[0, 0\] is nan; give numbers"),
-        ({"mass": np.ones(4)}, r"mass has shape \(4,\); \(3,\) is needed"),
+        ({"mass": np.ones(4)}, r"mass has shape \(4,\); give shape \(3,\), for 3 part"),
         (
             {"mass": np.array([1.0, 0.0, 1.0])},
             r"mass\[1\] is 0; give numbers from 1e-12 to 1000 kg",
         ),
         ({"mass": np.array([1.0, INF, 1.0])}, r"mass\[1\] is inf"),
-        ({"springs": np.zeros((3, 3), dtype=int)}, r"springs has shape \(3, 3\); \(3, 2\)"),
+        (
+            {"springs": np.zeros((3, 3), dtype=int)},
+            r"springs has shape \(3, 3\); give shape \(S, 2\)",
+        ),
         (
             {"springs": np.array([[0, 1], [1, 2], [0, 3]])},
             "springs names 3; the ids of 3 particles are 0",
@@ -423,14 +426,14 @@ def test_a_cloth_refuses(arguments, message):
         ({"springs": np.array([[0, 1], [1, 2], [0, -1]])}, "springs names -1"),
         ({"springs": np.array([[0, 1], [1, 2], [2, 2]])}, r"spring \[2, 2\] joins a particle to"),
         ({"springs": np.array([[0, 1], [1, 2], [1, 0]])}, r"spring \[0, 1\] is there twice"),
-        ({"families": np.zeros(2, dtype=int)}, r"families has shape \(2,\); \(3,\) is needed"),
+        ({"families": np.zeros(2, dtype=int)}, r"families has shape \(2,\); give shape \(3,\)"),
         ({"families": np.array([0, 3, 0])}, "families is 3 for spring 1; give 0 for stretch"),
         ({"families": np.array([0, 0, -1])}, "families is -1 for spring 2"),
-        ({"rest_length": np.ones(2)}, r"rest_length has shape \(2,\); \(3,\) is needed"),
+        ({"rest_length": np.ones(2)}, r"rest_length has shape \(2,\); give shape \(3,\)"),
         ({"rest_length": np.array([0.0, 1.0, 1.0])}, r"rest_length\[0\] is 0"),
         ({"stiffness": np.array([1.0, -2.0, 1.0])}, r"stiffness\[1\] is -2"),
         ({"damping": np.array([1.0, -2.0, 1.0])}, r"damping\[1\] is -2"),
-        ({"faces": np.zeros((1, 2), dtype=int)}, r"faces has shape \(1, 2\); \(1, 3\)"),
+        ({"faces": np.zeros((1, 2), dtype=int)}, r"faces has shape \(1, 2\); give shape \(F, 3\)"),
         ({"faces": np.array([[0, 1, 7]])}, "faces names 7; the ids of 3 particles are 0 to 2"),
     ],
 )

@@ -115,7 +115,7 @@ def test_a_symmetric_outline_has_a_mesh_that_is_its_mirror_image(y, wide, wanted
 @pytest.mark.parametrize(
     ("half", "message"),
     [
-        ([[0.1, 0], [0.2, 0], [0.2, 0.2], [0, 0.2]], "must begin and end at x = 0"),
+        ([[0.1, 0], [0.2, 0], [0.2, 0.2], [0, 0.2]], "let it begin and end at x = 0"),
         ([[0, 0], [0.2, 0], [0, 0.1], [0.2, 0.2], [0, 0.2]], "with x above zero between"),
         ([[0, 0], [-0.2, 0], [-0.2, 0.2], [0, 0.2]], r"has x from -0\.2 m"),
     ],

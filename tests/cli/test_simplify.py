@@ -382,7 +382,7 @@ def test_a_goal_of_another_count_than_the_body_is_refused(letters, tmp_path, cap
     body = tmp_path / "body.ply"
     trimesh.Trimesh(CLOTH.rest, CLOTH.faces, process=False).export(body)
     told = refused(capsys, tmp_path, letters[0], "--body", body)
-    assert "V.npz: the goal has shape (41, 3); (625, 3) is needed, one row of x, y, z" in told
+    assert "V.npz: the goal has shape (41, 3); give shape (625, 3), one row of x, y, z" in told
 
 
 @pytest.mark.parametrize(
@@ -417,6 +417,7 @@ def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys
         (("--figure", "out.txt"), "out.txt is no picture; give --figure a file in .jpg, .pdf"),
         ((*["V.npz"] * 40, "--figure", "out.png"), "41 goals are given; a picture shows 40"),
         (("--json", "a" * 256), "File name too long"),
+        (("--figure", "\0.png"), "null byte); give another --figure"),
     ],
 )
 def test_wrong_options_are_refused(options, message, letters, tmp_path, capsys, monkeypatch):

@@ -15,9 +15,9 @@ subdivide take turn use wait want wrap write
 """Verbs that tell a user what to do."""
 LIMITS = """
 above another array below between distinct each false file finite float folder four id ids integer
-itself json least mesh metres most names number numbers one only order out particle plan positive
-rope seconds shape sheet simple surface task text three triangles true two unique up utf-8 whole
-zero
+itself jaxsimp json least mesh metres most names number numbers once one only order out particle
+plan positive rope seconds shape sheet simple surface task text three triangles true two unique up
+utf-8 whole zero
 """
 """Words of what is allowed, besides numbers and lists of names."""
 

@@ -1,5 +1,6 @@
 """Values as short texts, for lines that reproduce an input and for messages that name it."""
 
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,8 @@ def spellings(value: Any) -> set[str]:
         }
     if isinstance(value, str):
         return found | {str(Path(value[:200]))}  # "" is the folder "."
+    if is_dataclass(value) and not isinstance(value, type):
+        return found.union(*(spellings(getattr(value, each.name)) for each in fields(value)))
     if isinstance(value, dict):
         return found.union(*map(spellings, value.values()), map(str, value))
     return found

@@ -7,7 +7,7 @@ import numpy as np
 
 from tests.fuzz.telling import is_jax
 
-SMALLEST, LARGEST = 0.02, 5.0
+SMALLEST, LARGEST = 0.01, 5.0
 """Limits of the largest extent of a body, metres."""
 
 

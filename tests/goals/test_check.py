@@ -25,7 +25,7 @@ def test_check_goal_gives_the_goal_as_floats():
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
-        (np.zeros((30, 2)), r"goal has shape \(30, 2\); \(30, 3\) is needed.*of the cloth"),
+        (np.zeros((30, 2)), r"goal has shape \(30, 2\); give shape \(30, 3\), .*of the cloth"),
         (np.zeros((29, 3)), r"goal has shape \(29, 3\)"),
         (np.zeros(3), r"goal has shape \(3,\)"),
     ],

@@ -190,7 +190,7 @@ def test_goals_of_other_types_and_orders_are_the_same_goal():
         np.testing.assert_array_equal(goals.as_goal(CLOTH, goal), given.astype(float))
     assert goals.as_goal(rope(2, 1.0), [[0, 0, 0], [1, 0, 0]]).dtype == np.float64
     for wrong in (FOLDED + 0j, FOLDED > 0, FOLDED.astype(object), "goal", None, [[1], [1, 2]]):
-        with pytest.raises(ValueError, match="the goal holds no real numbers; give a row of x"):
+        with pytest.raises(ValueError, match=r"the goal is .*; give real numbers, one row of x"):
             goals.as_goal(CLOTH, wrong)
 
 
@@ -310,9 +310,14 @@ def test_garments_of_two_sheets_are_flat():
             lambda: goals.fold(CLOTH, FOLDED, [0, 0], [0, 1], part=[0, 1, 2]),
             r"part is an array of int64, shape \(3,\); give true or false",
         ),
-        (lambda: goals.fold(CLOTH, FOLDED[:5], [0, 0], [0, 1]), "positions has 5 rows; give one f"),
+        (lambda: goals.fold(CLOTH, FOLDED[:5], [0, 0], [0, 1]), r"positions has shape \(5, 3\)"),
         (lambda: goals.fold(CLOTH, FOLDED, [0, 0, 0], [0, 1]), r"point is \[0, 0, 0\]; give"),
         (lambda: goals.fold(CLOTH, FOLDED, 0, 1j), "point is 0; give finite coordinates x and y"),
+        (lambda: goals.fold_sequence(CLOTH, 1), "folds is 1; give a list of Fold.point, direct"),
+        (lambda: goals.fold_sequence(CLOTH, np.array(6)), r"folds is array\(6\); give a list"),
+        (lambda: goals.fold_sequence(CLOTH, [()]), r"a fold is \(\); give a list of Fold"),
+        (lambda: goals.rectangle_folds(CLOTH, np.zeros(0)), "fold is an array of .*; choose from"),
+        (lambda: goals.lift_crossings(ROPE, ROPE.rest[:1]), r"shape \(1, 3\); give shape \(\d+, 3"),
         (lambda: goals.flat(CLOTH, "a"), "angle is 'a'; give a number"),
         (lambda: goals.turn(CLOTH.rest[:, :2], 1.0), r"positions is an array of shape \(30, 2\)"),
         (lambda: goals.straight(CLOTH), "the cloth has 40 triangles; only a rope is laid along"),

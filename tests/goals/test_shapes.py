@@ -70,10 +70,10 @@ def test_straight_has_the_rest_length_or_the_one_asked_for():
 @pytest.mark.parametrize(
     ("corners", "message"),
     [
-        (np.zeros((1, 2)), r"corners has shape \(1, 2\); \(M, 2\) with M of 2 or more"),
+        (np.zeros((1, 2)), r"corners has 1 rows; give at least 2, of x and y"),
         (np.zeros((3, 3)), r"corners is an array of shape \(3, 3\); give rows of 2 real"),
         (np.zeros(4), r"corners is an array of shape \(4,\)"),
-        (np.zeros((3, 2)), "polyline is 0 m long; give corners that are apart"),
+        (np.zeros((3, 2)), "polyline is 0 m long; give at least two corners that are apart"),
         (
             np.array([[0.0, 0.0], [np.nan, 0.0]]),
             r"corners\[1\] is \[nan, 0.0\] .*give finite numbers",

@@ -307,7 +307,7 @@ def test_bad_numbers_are_refused():
 
 @pytest.mark.usefixtures("unchecked_shapes")
 def test_wrong_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"H has shape \(1, 3, 3\); \(1, 2, 2\) is needed"):
+    with pytest.raises(ValueError, match=r"H has shape \(1, 3, 3\); give shape \(1, 2, 2\)"):
         one(np.eye(3), [0, 0])
-    with pytest.raises(ValueError, match=r"upper has shape \(1, 1\); \(1, 2\) is needed"):
+    with pytest.raises(ValueError, match=r"upper has shape \(1, 1\); give shape \(1, 2\)"):
         one(np.eye(2), [0, 0], upper=[1])

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsimp.bodies import Body
-from jaxsimp.checks import as_reals, require_number
+from jaxsimp.checks import as_reals, require_number, told
 from jaxsimp.simplification import qp
 
 Bound = tuple[float, float, float]
@@ -31,8 +31,8 @@ class Workspace:
             allow some, such as 0.05: a taut goal with noise is longer than the rope.
 
     Raises:
-        ValueError: if a bound is not three numbers, `lower` is above `upper`, `max_stretch` is no
-            number from 0 to 10, or another limit is not true or false.
+        ValueError: if a bound is not three numbers or leaves no room, `lower` is above `upper`,
+            `max_stretch` is no number from 0 to 10, or another limit is not true or false.
     """
 
     lower: Bound = (-np.inf,) * 3
@@ -42,16 +42,16 @@ class Workspace:
     max_stretch: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("lower", "upper"):
+        for name, never in (("lower", np.inf), ("upper", -np.inf)):
             bound = as_reals(getattr(self, name))
-            if bound is None or bound.shape != (3,) or np.isnan(bound).any():
+            if bound is None or bound.shape != (3,) or np.any(np.isnan(bound) | (bound == never)):
                 raise ValueError(
-                    f"{name} is {getattr(self, name)}; give x, y and z in metres, -inf or inf for "
-                    f"no limit"
+                    f"{name} is {told(getattr(self, name))}; give x, y and z in metres, -inf or "
+                    f"inf for no limit"
                 )
         for name in ("above_table", "fixed_ends"):
             if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"{name} is {getattr(self, name)!r}; give True or False")
+                raise ValueError(f"{name} is {told(getattr(self, name))}; give True or False")
         if not np.all(np.less_equal(self.lower, self.upper)):
             raise ValueError(
                 f"the workspace is from {self.lower} to {self.upper}; give an upper bound above "

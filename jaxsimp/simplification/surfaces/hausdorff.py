@@ -25,7 +25,7 @@ class Surface:
 
     def __post_init__(self) -> None:
         if len(self.faces) == 0:
-            raise ValueError("the surface has 0 triangles; at least 1 is needed")
+            raise ValueError("the surface has 0 triangles; give at least 1")
         if self.faces.min() < 0 or self.faces.max() >= len(self.points):
             raise ValueError(
                 f"faces names vertices {self.faces.min()} to {self.faces.max()}; "

@@ -150,7 +150,10 @@ def _is_rope_along(points: Any, mass: Any = None, material: Any = None, **change
     shape = is_array(points, (None, 3))
     if shape is False or len(points) < 2:
         return False
-    steps = np.linalg.norm(np.diff(as_floats(points), axis=0), axis=1)
+    rows = as_floats(points)
+    # A spring joins each particle to the next and to the one after it: none may have no length.
+    ends = [rows[1:] - rows[:-1], rows[2:] - rows[:-2]]
+    steps = np.linalg.norm(np.concatenate(ends), axis=1)
     others = _is_rope(mass=mass, material=material, **changes)
     return both(shape, bool((steps > 0).all()), is_size(extent(points)), others)
 

@@ -197,7 +197,7 @@ CHOICES = {
     "planning": ("nominal", "robust", "self_contact", "mixed"),
     "study": ("paper", "goals", "transfer"),
 }
-RANGES = {"elite_fraction": (0.0, 1.0), "smoothing": (0.0, 1.0), "initial_spread": (0.0, 1e9)}
+RANGES = {"elite_fraction": (1e-6, 1.0), "smoothing": (0.0, 1.0), "initial_spread": (1e-6, 1e3)}
 
 
 def _is_study(**given: Any) -> bool | None:

@@ -99,10 +99,11 @@ def _check_rope(result: Any, body: js.Body = ROPE, **_: Any) -> None:
     assert steps.max() < 1.3 * body.size, "a step is longer than the rope"
 
 
-def _check_fold(result: Any, body: js.Body, **_: Any) -> None:
+def _check_fold(result: Any, body: js.Body, positions: Any = None, **_: Any) -> None:
     _check_positions(result)
     assert result.shape == body.rest.shape, f"shape {result.shape}"
-    assert result[:, 2].min() > -1e-9, "a particle is under the table"
+    lowest = 0.0 if positions is None else min(0.0, as_floats(positions)[:, 2].min())
+    assert result[:, 2].min() > lowest - 1e-9, "a particle is under the table"
 
 
 def _is_angle(angle: Any) -> bool | None:
@@ -383,7 +384,7 @@ DOORS = (
             "part": array(st.just(CLOTH.rest[:, 1] > 0), optional=True),
         },
         lambda **given: _is_fold(CLOTH, **given),
-        lambda result, **_: _check_fold(result, CLOTH),
+        lambda result, positions, **_: _check_fold(result, CLOTH, positions),
         weight=15,
     ),
     Door(

@@ -117,6 +117,7 @@ def _one(body: js.Body) -> Door:
         lambda goal, **options: _is_call(body, goal, **options),
         lambda points, goal, **options: _check_one(points, body, goal, **options),
         weight=20,
+        prepare=lambda: js.simplify(body, GOALS[id(body)][1]),  # which compiles
     )
 
 
@@ -177,7 +178,11 @@ def _is_workspace(
         or np.isneginf(bounds[1]).any()
     ):
         return False
-    tuples = isinstance(lower, tuple) and isinstance(upper, tuple)
+    numbers = int | float | np.integer | np.floating
+    tuples = all(
+        isinstance(each, tuple) and all(isinstance(one, numbers) for one in each)
+        for each in (lower, upper)
+    )
     stretch = True if max_stretch is None else in_range(max_stretch, 0, 1, absurd=(0, 1e300))
     flags = both(is_flag(above_table), is_flag(fixed_ends))
     return both(True if tuples else None, stretch, flags)

@@ -360,9 +360,9 @@ def test_a_rope_is_refused():
 def test_no_method_for_surfaces_takes_goals_of_another_body(method):
     sheet = cloth(5)
     goal = goals.flat(sheet)
-    with pytest.raises(ValueError, match=r"the goal has shape \(24, 3\); \(25, 3\) is needed"):
+    with pytest.raises(ValueError, match=r"the goal has shape \(24, 3\); give shape \(25, 3\)"):
         method(sheet, goal[None, :24])
-    with pytest.raises(ValueError, match=r"the goal has shape \(3,\); \(25, 3\) is needed"):
+    with pytest.raises(ValueError, match=r"the goal has shape \(3,\); give shape \(25, 3\)"):
         method(sheet, goal)
     goal[7, 1] = np.nan
     with pytest.raises(ValueError, match=r"particle 7 is .* give finite"):
