@@ -29,7 +29,8 @@ from jaxsimp.checks import (
     require_whole,
     told,
 )
-from jaxsimp.dynamics.pickers import FARTHEST, Actions, Pickers, make_pickers, require_actions
+from jaxsimp.dynamics.arrays import FARTHEST
+from jaxsimp.dynamics.pickers import Actions, Pickers, make_pickers, require_actions
 from jaxsimp.dynamics.rollouts import rollout
 from jaxsimp.dynamics.simulation import Simulation, State, largest_time_step, make_simulation
 from jaxsimp.dynamics.springs import make_springs

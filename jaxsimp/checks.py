@@ -95,7 +95,7 @@ def require_choice(name: str, value: object, known: Collection[str]) -> None:
 def require_flag(name: str, value: object) -> None:
     """Raise a `ValueError` unless a value is true or false."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} is {_told(value)}; give True or False")
+        raise ValueError(f"{name} is {told(value)}; give True or False")
 
 
 def require_ids(name: str, values: object, count: int, of: str = "particles") -> np.ndarray:
