@@ -1,7 +1,8 @@
-"""The door for numbers: a `ValueError` that names the value, the limits and the remedy."""
+"""The door for numbers and paths: a `ValueError` that names the value, limits and remedy."""
 
 from collections.abc import Collection
 from numbers import Integral
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -197,6 +198,16 @@ def require_rows(name: str, values: object, width: int, unit: str = "m") -> np.n
             f"numbers, in {unit}"
         )
     return array
+
+
+def require_path(path: Path, remedy: str) -> None:
+    """Raise a `ValueError` with a remedy for a path that no file can have, as with a null byte."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{str(path)[:60]!r} can be no file ({error}); {remedy}") from error
 
 
 def as_reals(values: object) -> np.ndarray | None:

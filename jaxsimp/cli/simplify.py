@@ -86,8 +86,7 @@ class Options:
                 file's.
         """
         from jaxsimp.bodies.size import LARGEST, require_scale
-        from jaxsimp.checks import require_choice, require_number
-        from jaxsimp.records.files import require_path
+        from jaxsimp.checks import require_choice, require_number, require_path
         from jaxsimp.simplification.key_points import SMALLEST_TOLERANCE
 
         if not self.goals:

@@ -43,16 +43,6 @@ def whole_file(path: str | Path) -> Iterator[Path]:
             shutil.rmtree(part, ignore_errors=True)
 
 
-def require_path(path: Path, remedy: str) -> None:
-    """Raise a `ValueError` with a remedy for a path that no file can have, as with a null byte."""
-    try:
-        path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{str(path)[:60]!r} can be no file ({error}); {remedy}") from error
-
-
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file: under its name it is complete or absent."""
     with whole_file(path) as part:

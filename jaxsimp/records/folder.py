@@ -6,7 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from jaxsimp.records.files import PART, remove_parts, require_path, write_json
+from jaxsimp.checks import require_path
+from jaxsimp.records.files import PART, remove_parts, write_json
 from jaxsimp.records.lock import HOLDER_FILE, LOCK_FILE, ResultsError, lock_folder, not_writable
 
 CONFIG_FILE = "config.json"

@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsimp.bodies import Body
-from jaxsimp.checks import as_reals, require_choice, require_shape, told
+from jaxsimp.bodies.size import LARGEST
+from jaxsimp.checks import as_reals, require_choice, require_number, require_shape, told
 from jaxsimp.goals import Positions, as_goal
-from jaxsimp.simplification.key_points import FitStatus, KeyPoints
+from jaxsimp.simplification.key_points import SMALLEST_TOLERANCE, FitStatus, KeyPoints
 from jaxsimp.simplification.ropes.fit import Workspace, why_infeasible
 from jaxsimp.simplification.ropes.optimal import simplify_optimal
 from jaxsimp.simplification.ropes.uniform import simplify_uniform
@@ -54,6 +55,8 @@ def simplify_batch(
             range, or a workspace is given for a surface.
     """
     require_choice("method", method, METHODS)
+    if tolerance is not None:
+        tolerance = require_number("tolerance", tolerance, SMALLEST_TOLERANCE, LARGEST, "m")
     checked = [as_goal(body, goal) for goal in _each(body, goals)]
     simplify_ropes, simplify_surfaces = METHODS[method]
     if workspace is not None and not isinstance(workspace, Workspace):

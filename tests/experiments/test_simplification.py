@@ -58,7 +58,7 @@ def test_a_case_is_the_same_goal_every_time():
     ("options", "message"),
     [
         (("--methods", "best"), "unknown method 'best'; choose from robust, paper"),
-        (("--seeds", "0"), "seeds is 0; at least 1"),
+        (("--seeds", "0"), "seeds is 0; give a whole number"),
     ],
 )
 def test_wrong_values_are_named_and_nothing_is_written(options, message, tmp_path, capsys):

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.meshes import face_areas
 from jaxsimp.bodies.topology import are_among, chain, half_edges
-from jaxsimp.checks import require_choice, require_flag, require_ids, require_number
+from jaxsimp.checks import require_choice, require_flag, require_ids, require_number, require_path
 from jaxsimp.dynamics import Obstacle, Table, largest_time_step
 from jaxsimp.dynamics.arrays import require_known, require_positions
 from jaxsimp.dynamics.contact.obstacles import make_obstacles
@@ -159,6 +159,7 @@ def save_mjcf(
         ValueError: as for `make_model`, or if positions are not those of the body.
         OSError: if the file cannot be written.
     """
+    require_path(Path(path), "give the path of a file that can be written")
     spec = _spec(body, as_variant(variant), graspable, obstacles)
     if position is not None:
         places = require_positions("position", position, body.num_particles)

@@ -5,7 +5,6 @@ import json
 import zipfile
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from hypothesis import strategies as st
 
@@ -176,7 +175,7 @@ def _check_saved(content: bytes, pick: Any = PICK, displacement: Any = MOVE, **_
     path.write_bytes(content)
     saved = js.load_plan(path)
     assert np.array_equal(np.asarray(saved.actions.pick), np.asarray(pick)), "other picks"
-    wanted = np.asarray(jnp.asarray(displacement))
+    wanted = np.asarray(displacement, dtype=saved.actions.displacement.dtype)
     assert np.array_equal(np.asarray(saved.actions.displacement), wanted), "other displacements"
     assert np.array_equal(saved.task().body.rest, TASK.body.rest), "another body"
 

@@ -134,7 +134,7 @@ def test_layers_that_cover_each_other_count_once():
 
 
 def test_bad_surfaces_and_spacings_are_refused():
-    with pytest.raises(ValueError, match="0 triangles; at least 1"):
+    with pytest.raises(ValueError, match="0 triangles; give at least 1"):
         Surface(SQUARE, np.zeros((0, 3), dtype=int))
     with pytest.raises(ValueError, match=r"vertices 0 to 4; .* ids 0 to 3"):
         Surface(SQUARE, np.array([[0, 1, 4]]))
