@@ -240,6 +240,7 @@ def bomb(shape) -> bytes:
         (b"PK\x03\x04" + bytes(50), "it is damaged, or is no .npz file; give an"),
         (b"", "it is empty; give an .npz file, written with np.savez"),
     ],
+    ids=["text", "other name", "nothing", "bomb", "overflow", "cut short", "damaged", "empty"],
 )  # fmt: skip
 def test_an_npz_file_of_another_kind_is_told(content, message, tmp_path):
     path = tmp_path / "goal.npz"
