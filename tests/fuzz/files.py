@@ -1,8 +1,11 @@
 """Files of each format, whole and damaged, as arguments of doors that take a path."""
 
+import atexit
 import gzip
 import io
 import json
+import os
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterable
@@ -17,8 +20,9 @@ from hypothesis.strategies import SearchStrategy
 
 from tests.fuzz.core import Parameter
 
-FOLDER = Path(tempfile.gettempdir()) / "jaxsimp-fuzz-files"
-"""Folder of the files of all inputs, each replaced by the next."""
+FOLDER = Path(tempfile.gettempdir()) / f"jaxsimp-fuzz-{os.getpid()}"
+"""Folder of the files of all inputs of this process, each replaced by the next."""
+atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 
 
 @dataclass(frozen=True)

@@ -174,7 +174,7 @@ BAD: tuple[Change, ...] = (
     lambda array: array * 1e-4,
     lambda array: array * 1e30,
     lambda array: array * 0,
-    lambda array: -array,
+    lambda array: ~array if array.dtype == bool else -array,
     lambda array: array[:-1],
     lambda array: array[:0],
     lambda array: array[:1],

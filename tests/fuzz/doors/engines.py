@@ -180,6 +180,12 @@ def _paths() -> Parameter:
     return Parameter(good, bad | anything, optional=False)
 
 
+def _is_place(position: Any) -> bool | None:
+    """Positions of the body; beyond 1e6 m either will do."""
+    verdict = is_array(position, (5, 3))
+    return None if verdict and np.abs(np.asarray(position)).max() > 1e6 else verdict
+
+
 def _is_path(path: Any) -> bool | None:
     FOLDER.mkdir(exist_ok=True)
     if not isinstance(path, str) and not hasattr(path, "__fspath__"):
@@ -248,7 +254,7 @@ DOORS = (
         _save,
         {"path": _paths(), "position": array(st.just(TASK.body.rest), optional=True)},
         lambda path, position=None: both(
-            _is_path(path), True if position is None else is_array(position, (5, 3))
+            _is_path(path), True if position is None else _is_place(position)
         ),
         weight=5,
     ),
