@@ -63,8 +63,8 @@ class Material:
     thickness: float
 
     def __post_init__(self) -> None:
-        for name, limits in LIMITS.items():
-            require_number(name, getattr(self, name), *limits)
+        for name, limits in LIMITS.items():  # plain floats: others round what is made of them
+            object.__setattr__(self, name, require_number(name, getattr(self, name), *limits))
 
     def changed(self, **values: float) -> "Material":
         """The material with other values of some parameters.

@@ -187,3 +187,12 @@ def test_shear_is_refused_where_there_are_no_such_springs():
 
 def test_what_is_fitted_can_be_scaled():
     assert set(PARAMETERS) < set(FACTORS)
+
+
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_a_number_of_low_precision_is_taken_as_a_float():
+    given = MATERIALS["rope"].changed(density=np.float16(0.1))
+    assert type(given.density) is float
+    body = rope(5, 0.3, material=given)
+    # Exact but for rounding of float64; float16 has 11 bits.
+    np.testing.assert_allclose(body.mass.sum(), float(np.float16(0.1)) * 0.3, rtol=1e-14)
