@@ -16,7 +16,7 @@ from numba import cfunc, njit
 try:
     from jaxsimp.numba_cache import Kept, NotKept, make_callback
 except (ImportError, AttributeError):  # of a numba that is made otherwise: see there
-    Kept = None  # type: ignore[assignment, misc]
+    Kept = None  # type: ignore[assignment, misc] # of a class, to say that there is none
 
 
 def compiler(what: str, **options: Any) -> Callable[[Any], Any]:

@@ -41,7 +41,7 @@ class _Place(CompileResultCacheImpl):
     A user without a home and a name has the home `~`: a folder of that name, wherever one is.
     """
 
-    _locator_classes = [  # noqa: RUF012 # as numba has it
+    _locator_classes = [  # noqa: RUF012 # numba reads a list of the class
         each
         for each in CompileResultCacheImpl._locator_classes
         if each is not UserWideCacheLocator

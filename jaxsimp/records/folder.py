@@ -9,6 +9,7 @@ from typing import Any
 from jaxsimp.checks import require_path
 from jaxsimp.records.files import PART, remove_parts, write_json
 from jaxsimp.records.lock import HOLDER_FILE, LOCK_FILE, ResultsError, lock_folder, not_writable
+from jaxsimp.records.rows import difference
 
 CONFIG_FILE = "config.json"
 
@@ -77,13 +78,8 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 
 def _require_same(folder: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    differing = sorted(
-        name for name in found.keys() | wanted.keys() if found.get(name) != wanted.get(name)
-    )
-    if differing:
-        name = differing[0]
+    if told := difference(found, wanted):
         raise ResultsError(
-            f"{folder} was made with another configuration: {', '.join(differing)} differ "
-            f"({name}: {found.get(name)!r} there, {wanted.get(name)!r} now); "
-            f"give another folder with --out, or remove this one"
+            f"{folder} was made with another configuration: {told}; give another folder with "
+            f"--out, or remove this one"
         )

@@ -40,8 +40,8 @@ UNREADABLE = (
     EOFError,
     TypeError,
     KeyError,
-    NotImplementedError,
-    RuntimeError,
+    NotImplementedError,  # of zipfile, for a compression that it does not know
+    RuntimeError,  # of zipfile, for an encrypted member
     MemoryError,
     OverflowError,
     SyntaxError,

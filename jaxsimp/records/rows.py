@@ -126,8 +126,11 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
     A last line that a kill left incomplete is removed.
     """
     with path.open("a+b") as file:
-        file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)
+        end = file.seek(0, os.SEEK_END)
+        file.seek(max(end - 1, 0))
+        if file.read() not in (b"", b"\n"):
+            file.seek(0)
+            file.truncate(file.read().rfind(b"\n") + 1)
         file.write(_line(row).encode())
         file.flush()
         os.fsync(file.fileno())
@@ -222,16 +225,21 @@ def _require_environment(
     now = _flat(json.loads(json.dumps(_that_counts(environment))))
     for row in rows:
         there = _flat(_that_counts(row.get("environment")) or {})
-        differing = sorted(
-            name for name in there.keys() | now.keys() if there.get(name) != now.get(name)
-        )
-        if differing:
-            name = differing[0]
+        if told := difference(there, now):
             raise ResultsError(
-                f"{path} has rows of another environment: {', '.join(differing)} differ ({name}: "
-                f"{there.get(name)!r} there, {now.get(name)!r} now); give another folder with "
-                f"--out, or --mixed to go on in this one, and the report says so"
+                f"{path} has rows of another environment: {told}; give another folder with --out, "
+                f"or --mixed to go on in this one, and the report says so"
             )
+
+
+def difference(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Names whose values differ, with the values of the first; empty if all are equal."""
+    names = sorted(name for name in there.keys() | now.keys() if there.get(name) != now.get(name))
+    if not names:
+        return ""
+    first = names[0]
+    values = f"{there.get(first)!r} there, {now.get(first)!r} now"
+    return f"{', '.join(names)} differ ({first}: {values})"
 
 
 def _flat(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -166,7 +166,7 @@ class Door:
 
     def judge_input(self, one: Input, index: int = -1) -> Judged:
         """Call the door with an input, and judge what happens."""
-        self._prepared  # noqa: B018
+        self._prepared  # noqa: B018 # the first look prepares
         text = str(one)
         valid = self._verdict(one)
         start = time.perf_counter()

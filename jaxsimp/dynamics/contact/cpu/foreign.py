@@ -11,7 +11,7 @@ from typing import Any, no_type_check  # numba needs functions as they are, not 
 
 import jax
 import numpy as np
-from numba import carray, njit, types  # type: ignore[attr-defined] # gathered at import
+from numba import carray, njit, types  # type: ignore[attr-defined] # set when numba is imported
 from numba.extending import intrinsic
 
 from jaxsimp.compiling import callback, compiler
