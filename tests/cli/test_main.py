@@ -152,7 +152,11 @@ sys.exit(exit_status(run, "stopped; go on with the same command"))
 
 
 def signalled(number, first="", last="print('put away', flush=True)", times=1):
-    """Exit status, output and errors of a command that is sent a signal at work."""
+    """Exit status, output and errors of a command that is sent a signal at work.
+
+    Signals have their default meaning at its start, also where nohup runs the tests.
+    """
+    first = f"signal.signal(signal.SIGHUP, signal.SIG_DFL); {first}"
     with subprocess.Popen(
         [sys.executable, "-c", SLEEPING.format(first=first, last=last)],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
