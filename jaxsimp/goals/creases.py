@@ -133,7 +133,7 @@ def _fitted(panels: Panels, moves: Moves, first: Creases) -> tuple[Creases, floa
 
     scale = float(np.abs(panels.rest).max())
 
-    def misfit(values: Float[np.ndarray, " V"]) -> Float[np.ndarray, " 2*N"]:
+    def misfit(values: Float[np.ndarray, " V"]) -> Float[np.ndarray, " _"]:
         *_, place = first.changed(values, scale).stages(panels.rest, moves)
         off = (place - panels.goal) / scale
         return np.concatenate([off.real, off.imag])

@@ -22,6 +22,8 @@ BESIDE = 0.03
 """Largest fraction of the particles of what unfolds that may lie on the other side of the line."""
 MOST_STATES = 1000
 """Largest number of partly unfolded states looked at."""
+MOST_FOLDS = 8
+"""Largest number of folds in an order."""
 MOST_ORDERS = 16
 """Largest number of orders returned."""
 
@@ -115,6 +117,8 @@ def unfoldings(panels: Panels, above: Int[np.ndarray, "P P"]) -> list[Order]:
         seen.add(state)
         if not sheet.creases():
             orders.append(Order(steps, sheet.maps))
+        if len(steps) == MOST_FOLDS:
+            continue
         found = list(_candidates(sheet))
         stack += [(sheet.unfolded(step), (*steps, step)) for step in found[::-1]]
     return orders

@@ -17,6 +17,9 @@ RINGS = 2
 """How far from its panels, in edges, a fold takes along what lies left of the line: a particle near
 a crease may be counted to either side."""
 
+MOST_CHOICES = 8
+"""Largest number of choices, of whole or part at each fold, that are carried out."""
+
 
 @dataclass(frozen=True, eq=False)
 class Refolding:
@@ -80,7 +83,7 @@ def refold(body: Body, goal: Positions, panels: Panels, order: Order) -> Refoldi
         own = _dilated(panels, step.moved[panels.label])
         found = [
             longer for one in found for longer in _folded(body, panels, one, creases, index, own)
-        ]
+        ][:MOST_CHOICES]
     results = [_compared(panels, goal, one) for one in found]
     return min(results, key=lambda one: one.squared)
 

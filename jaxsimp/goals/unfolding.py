@@ -11,7 +11,7 @@ from jaxsimp.bodies.topology import distinct_edges, half_edges
 from jaxsimp.checks import require_reals
 from jaxsimp.goals.check import as_goal
 from jaxsimp.goals.folds import Fold
-from jaxsimp.goals.orders import unfoldings
+from jaxsimp.goals.orders import MOST_FOLDS, unfoldings
 from jaxsimp.goals.panels import (
     COVERS,
     LEAST_PARTICLES,
@@ -74,8 +74,8 @@ def find_folds(body: Body, goal: Positions) -> tuple[Fold, ...]:
     Raises:
         ValueError: if the body is a rope or not flat at rest, the goal is none of the body's (see
             `as_goal`), or there are no folds that give it: it is not flat on the table, is turned
-            over, has a part tucked under, has more than `MOST_PANELS` panels, or two orders of its
-            layers are about equally likely.
+            over, has a part tucked under, has more than `MOST_PANELS` panels or `MOST_FOLDS` folds,
+            or two orders of its layers are about equally likely.
     """
     return _unfold(body, goal).folds
 
@@ -184,7 +184,10 @@ def _why_none(body: Body, count: int, is_turned: bool) -> str:
     if is_turned:
         what = "lies face down: it was turned over, or a part of it is tucked under"
     else:
-        what = f"has {count} panels that cannot be unfolded from the top, one fold after another"
+        what = (
+            f"has {count} panels that cannot be unfolded from the top, one fold after another, by "
+            f"up to {MOST_FOLDS} folds"
+        )
     return f"the goal of the {body.name} {what}; {_REMEDY}"
 
 
@@ -251,7 +254,7 @@ def _are_alike(body: Body, wanted: Refolding, found: Refolding) -> bool:
     heights = [one.end[:, 2] for one in (wanted, found)]
     above, still = (height[first] - height[second] for height in heights)
     counts = np.abs(above) > body.radius  # not of one layer
-    return not counts.any() or np.mean((above * still > 0)[counts]) >= ALIKE
+    return not counts.any() or bool(np.mean((above * still > 0)[counts]) >= ALIKE)
 
 
 def _from_rest(body: Body, found: Refolding) -> Complex[np.ndarray, " N"]:
