@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxsimp import goals
@@ -224,7 +224,7 @@ def test_an_end_that_is_not_flat_has_other_folds(unchecked_shapes):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cloth_quarter_fold", "cloth_letter_fold", "cloth_four_corners"])
 def test_goals_let_go_and_settled_have_the_same_folds(name):
-    task = make_task(name, resolution=13)
+    task = make_task(name, resolution=17)
     engine = MassSprings(self_contact=True)
     shape = (task.settle_actions, task.num_pickers)
     idle = Actions(jnp.full(shape, NONE), jnp.zeros((*shape, 3)))
