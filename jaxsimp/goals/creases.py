@@ -97,15 +97,19 @@ class Creases:
         return replace(self, lines=tuple(lines))
 
 
-def fit_creases(panels: Panels, order: Order) -> Creases:
-    """Start and lines that carry the panels from rest to the goal, in an order of unfolding.
+def fit_creases(panels: Panels, moves: Moves, first: Creases) -> Creases:
+    """Start and lines that carry the particles from rest to the goal.
 
     Least squares with a bounded pull of outliers. Folds of a grid often lie on a row of particles,
     which form the crease; beside it by noise, a line would send each of them to one side or the
     other. Lines are therefore put on rows where this hardly adds to the misfit.
+
+    Args:
+        panels: the panels of the goal.
+        moves: for each fold true for the particles that it turns over, shape (N,).
+        first: a first guess.
     """
-    moves = [step.moved[panels.label] for step in order.steps[::-1]]
-    best, least = _fitted(panels, moves, _guess(panels, order))
+    best, least = _fitted(panels, moves, first)
     variance = max(least / (2 * len(panels.rest)), EXACT**2)
     for index in range(len(moves)):
         for row in _rows(panels, moves, best, index):
@@ -116,7 +120,7 @@ def fit_creases(panels: Panels, order: Order) -> Creases:
     return best
 
 
-def _guess(panels: Panels, order: Order) -> Creases:
+def guess_creases(panels: Panels, order: Order) -> Creases:
     """Start and lines as panels have them: the start of the largest, points near the middle."""
     middle, largest = complex(panels.goal.mean()), int(panels.counts.argmax())
     lines = []

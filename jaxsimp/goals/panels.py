@@ -19,7 +19,7 @@ NOISE_FACTOR = 5.0
 noise: one particle in 10^5 is farther away."""
 LEAST_PARTICLES = 4
 THINNEST = 0.3
-"""Least standard deviation across a panel's particles, in edges: one row has no facing."""
+"""Least standard deviation across a panel's particles, in short edges: one row has no facing."""
 ROUNDS = 10
 """Rounds of labels and fits in turn; a handful suffice."""
 SURE = 3.0
@@ -82,6 +82,7 @@ class Panels:
         maps: isometries from rest to goal.
         edges: edges of the triangles, shape (E, 2).
         edge: median length of an edge at rest, metres.
+        short_edge: length below which a tenth of the edges are, metres.
         tolerance: distance from its isometry at which a particle may belong to a panel, metres.
     """
 
@@ -91,6 +92,7 @@ class Panels:
     maps: Isometries
     edges: Int[np.ndarray, "E 2"]
     edge: float
+    short_edge: float
     tolerance: float
 
     @property
@@ -115,13 +117,14 @@ def find_panels(
     """
     rest, place = (points[:, 0] + 1j * points[:, 1] for points in (body.rest, goal))
     edges, _, _ = distinct_edges(half_edges(body.faces)[0])
-    edge = float(np.median(np.abs(rest[edges[:, 1]] - rest[edges[:, 0]])))
+    lengths = np.abs(rest[edges[:, 1]] - rest[edges[:, 0]])
+    edge, short = float(np.median(lengths)), float(np.percentile(lengths, 10))
     near = _neighbourhoods(edges, len(rest))
     misfit = _patch_misfits(near, rest, place)
     used = np.unique(edges)
     noise = float(np.percentile(misfit[used], 25))
     tolerance = max(growth * body.size, NOISE_FACTOR * noise)
-    start = Panels(rest, place, np.full(len(rest), -1), _none(), edges, edge, tolerance)
+    start = Panels(rest, place, np.full(len(rest), -1), _none(), edges, edge, short, tolerance)
     grown = _grow(start, near, used[np.argsort(misfit[used], kind="stable")], 4 * most)
     if grown is None or not len(grown.maps.turn):
         return None
@@ -250,7 +253,7 @@ def _is_broad(panels: Panels, inside: Bool[np.ndarray, " N"]) -> bool:
     if len(points) < LEAST_PARTICLES:
         return False
     flat = np.stack([points.real, points.imag])
-    return bool(np.linalg.eigvalsh(np.cov(flat))[0] > (THINNEST * panels.edge) ** 2)
+    return bool(np.linalg.eigvalsh(np.cov(flat))[0] > (THINNEST * panels.short_edge) ** 2)
 
 
 def _fitted(panels: Panels, count: int) -> Panels:

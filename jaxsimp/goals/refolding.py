@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsimp.bodies import Body
-from jaxsimp.goals.creases import Creases, fit_creases
+from jaxsimp.goals.creases import Creases, Moves, fit_creases, guess_creases
 from jaxsimp.goals.folds import Fold, fold
 from jaxsimp.goals.orders import Order
 from jaxsimp.goals.panels import Panels
@@ -17,6 +18,10 @@ RINGS = 2
 """How far from its panels, in edges, a fold takes along what lies left of the line: a particle near
 a crease may be counted to either side."""
 
+ROUNDS = 3
+"""Largest number of times that lines are fitted to what they turned over."""
+BETTER = 0.98
+"""Squared distance from the goal, relative to that before, above which it is not done again."""
 MOST_CHOICES = 8
 """Largest number of choices, of whole or part at each fold, that are carried out."""
 
@@ -48,6 +53,12 @@ class Refolding:
         return self.states[-1] if self.states else self.start
 
     @property
+    def moves(self) -> list[Bool[np.ndarray, " N"]]:
+        """For each fold true for the particles that it turned over, shape (N,)."""
+        before = (self.start, *self.states)
+        return [(a[:, :2] != b[:, :2]).any(axis=1) for a, b in pairwise(before)]
+
+    @property
     def squared(self) -> float:
         """Sum of the squared distances from the goal, square metres."""
         return float(np.sum(self.off**2))
@@ -73,17 +84,32 @@ def refold(body: Body, goal: Positions, panels: Panels, order: Order) -> Refoldi
     """The folds of an order, fitted to the goal and carried out.
 
     A fold turns over all that lies left of its line, or its panels alone: of these the choice that
-    gives the goal best.
+    gives the goal best. The lines are then fitted anew to the particles that they did turn over,
+    some of which the panels may count wrongly.
     """
-    creases = fit_creases(panels, order)
+    parts = [step.moved[panels.label] for step in order.steps[::-1]]
+    creases = fit_creases(panels, parts, guess_creases(panels, order))
+    best = _carried_out(body, goal, panels, creases, parts)
+    for _ in range(ROUNDS):
+        creases = fit_creases(panels, best.moves, creases)
+        after = _carried_out(body, goal, panels, creases, parts)
+        if after.squared > BETTER * best.squared:
+            break
+        best = after
+    return best
+
+
+def _carried_out(
+    body: Body, goal: Positions, panels: Panels, creases: Creases, parts: Moves
+) -> Refolding:
     start = flat(body, creases.angle)
     start[:, :2] += creases.shift.real, creases.shift.imag
     found: list[_Folded] = [((), (start,))]
-    for index, step in enumerate(order.steps[::-1]):
-        own = _dilated(panels, step.moved[panels.label])
-        found = [
-            longer for one in found for longer in _folded(body, panels, one, creases, index, own)
-        ][:MOST_CHOICES]
+    for index, part in enumerate(parts):
+        own = _dilated(panels, part)
+        found = [longer for one in found for longer in _folded(body, one, creases, index, own)][
+            :MOST_CHOICES
+        ]
     results = [_compared(panels, goal, one) for one in found]
     return min(results, key=lambda one: one.squared)
 
@@ -93,7 +119,6 @@ _Folded = tuple[tuple[Fold, ...], tuple[Positions, ...]]  # the folds; the start
 
 def _folded(
     body: Body,
-    panels: Panels,
     before: _Folded,
     creases: Creases,
     index: int,

@@ -1,7 +1,6 @@
 """The folds of a goal, found from the goal alone: the inverse of `jaxsimp.goals.fold_sequence`."""
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Complex, Int
@@ -26,6 +25,9 @@ from jaxsimp.goals.shapes import Positions, require_flat
 OFF = 0.045
 """Largest distance of the folds' end from the goal, relative to the body's size. Of the fold tasks,
 let go and settled, it is up to 0.04 at the ends of creases."""
+SPRUNG = 3.0
+"""Largest height of the goal's layers above those of the folds, as a multiple of the distance in
+the plane, if above half a thickness: layers of settled goals spring open, by 2 times that."""
 ATTEMPTS = ((0.025, True), (0.012, True), (0.025, False), (0.012, False))
 """What is tried in turn: distance from a panel's isometry within which it grows, relative to the
 body's size, as panels of settled goals are bent; and whether only what lies on top unfolds, since
@@ -103,11 +105,7 @@ def subgoals(body: Body, goal: Positions) -> tuple[Subgoal, ...]:
     """
     found = _unfold(body, goal)
     ends = (*found.states[:-1], as_goal(body, goal))
-    before = (found.start, *found.states)
-    return tuple(
-        Subgoal(end, (old[:, :2] != new[:, :2]).any(axis=1), one)
-        for end, old, new, one in zip(ends, before, found.states, found.folds, strict=False)
-    )
+    return tuple(map(Subgoal, ends, found.moves, found.folds))
 
 
 def same_folds(body: Body, goal: Positions, end: Positions) -> bool:
@@ -214,9 +212,10 @@ def _likeliest(body: Body, found: list[Refolding]) -> Refolding:
 def _check_near(body: Body, found: Refolding) -> None:
     """Raise a `ValueError` for folds that do not give the goal."""
     limit = OFF * body.size
+    low = min(limit, max(body.radius, SPRUNG * found.beside))
     for what, off, most, name in (
         ("the place of a particle", found.beside, limit, f"{OFF:g} of its size"),
-        ("panels too low by", -found.heights.min(), limit, f"{OFF:g} of its size"),
+        ("panels too low by", -found.heights.min(), low, "by its distances in the plane"),
         ("panels too high by", found.heights.max(), body.radius, "half its thickness"),
     ):
         if off > most:
@@ -266,9 +265,7 @@ def _from_rest(body: Body, found: Refolding) -> Complex[np.ndarray, " N"]:
 
 def _turned(found: Refolding) -> Bool[np.ndarray, " N"]:
     """Whether each particle lies face down."""
-    before = (found.start, *found.states)
-    moves = [(a[:, :2] != b[:, :2]).any(axis=1) for a, b in pairwise(before)]
-    return np.sum(moves, axis=0, dtype=int) % 2 == 1 if moves else np.zeros(len(found.start), bool)
+    return np.sum([np.zeros(len(found.start), dtype=int), *found.moves], axis=0) % 2 == 1
 
 
 def _covering(body: Body, place: Complex[np.ndarray, " N"]) -> Int[np.ndarray, "2 _"]:
