@@ -112,8 +112,8 @@ def same_folds(body: Body, goal: Positions, end: Positions) -> bool:
     """Whether an end unfolds to the same folds as a goal, wherever both lie on the table.
 
     Both are unfolded and folded again from the body at rest. They are the same if they have the
-    same number of folds and up to `1 - ALIKE` of the particles lie within `SHIFTED` of each other
-    with the same facing, and of those that cover each other, in the same order of layers.
+    same number of folds and up to `1 - ALIKE` of the particles lie farther than `SHIFTED` from each other
+    in the plane, and of those that cover each other, in the same order of layers.
 
     Args:
         body: a body with triangles, flat at rest.
@@ -215,7 +215,12 @@ def _check_near(body: Body, found: Refolding) -> None:
     low = min(limit, max(body.radius, SPRUNG * found.beside))
     for what, off, most, name in (
         ("the place of a particle", found.beside, limit, f"{OFF:g} of its size"),
-        ("panels too low by", -found.heights.min(), low, "by its distances in the plane"),
+        (
+            "panels too low by",
+            -found.heights.min(),
+            low,
+            f"half its thickness or {SPRUNG:g} times the former",
+        ),
         ("panels too high by", found.heights.max(), body.radius, "half its thickness"),
     ):
         if off > most:
@@ -247,7 +252,7 @@ def _num_higher(body: Body, one: Refolding, other: Refolding) -> int:
 def _are_alike(body: Body, wanted: Refolding, found: Refolding) -> bool:
     places = [_from_rest(body, one) for one in (wanted, found)]
     near = np.abs(places[0] - places[1]) <= SHIFTED * body.size
-    if np.mean(near & (_turned(wanted) == _turned(found))) < ALIKE:
+    if np.mean(near) < ALIKE:
         return False
     first, second = _covering(body, places[0])
     heights = [one.end[:, 2] for one in (wanted, found)]
@@ -261,11 +266,6 @@ def _from_rest(body: Body, found: Refolding) -> Complex[np.ndarray, " N"]:
     start, rest, end = (p[:, 0] + 1j * p[:, 1] for p in (found.start, body.rest, found.end))
     turn, shift, _ = fit_isometry(start, rest)
     return turn * end + shift
-
-
-def _turned(found: Refolding) -> Bool[np.ndarray, " N"]:
-    """Whether each particle lies face down."""
-    return np.sum([np.zeros(len(found.start), dtype=int), *found.moves], axis=0) % 2 == 1
 
 
 def _covering(body: Body, place: Complex[np.ndarray, " N"]) -> Int[np.ndarray, "2 _"]:

@@ -91,6 +91,7 @@ def test_folds_of_the_tasks_are_found(name):
             np.testing.assert_allclose(have, wanted, atol=ROUNDING)
 
 
+@settings(max_examples=15)
 @given(name=st.sampled_from(list(TASKS)), seed=st.integers(0, 10**6), noise=st.floats(0, 2e-3))
 def test_noise_of_two_millimetres_does_no_harm(name, seed, noise):
     body, folds = TASKS[name]
@@ -279,7 +280,7 @@ REFUSED = {
     "in the air": (
         lambda: CLOTH,
         lambda: goals.flat(CLOTH) + np.array([0, 0, 0.1]),
-        r"panels too low by 0\.1 m, and 0\.0135 m, 0\.045 of its size, is the limit; give a goal",
+        r"panels too low by 0\.1 m, and 0\.002 m, half its thickness or 3 times the former, is",
     ),
     "upright": (
         lambda: CLOTH,
