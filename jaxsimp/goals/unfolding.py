@@ -111,9 +111,9 @@ def subgoals(body: Body, goal: Positions) -> tuple[Subgoal, ...]:
 def same_folds(body: Body, goal: Positions, end: Positions) -> bool:
     """Whether an end unfolds to the same folds as a goal, wherever both lie on the table.
 
-    Both are unfolded and folded again from the body at rest. They are the same if they have the
-    same number of folds and up to `1 - ALIKE` of the particles lie farther than `SHIFTED` from each other
-    in the plane, and of those that cover each other, in the same order of layers.
+    Both are unfolded, and folded again from the body at rest. They are the same if they have the
+    same number of folds, at least `ALIKE` of the particles lie within `SHIFTED` of each other in
+    the plane, and at least `ALIKE` of the pairs that cover each other are in the same order.
 
     Args:
         body: a body with triangles, flat at rest.
