@@ -91,6 +91,7 @@ if TYPE_CHECKING:
         replay,
     )
     from jaxsimp.engines.mujoco import make_model, save_mjcf
+    from jaxsimp.goals import Subgoal, find_folds, same_folds, subgoals
     from jaxsimp.planning import (
         CEM,
         ENCODINGS,
@@ -174,6 +175,7 @@ __all__ = [
     "Sphere",
     "Spread",
     "State",
+    "Subgoal",
     "Table",
     "Task",
     "Workspace",
@@ -186,6 +188,7 @@ __all__ = [
     "compare_with_mjx",
     "dynamics",
     "engines",
+    "find_folds",
     "from_mesh",
     "goal_scores",
     "goals",
@@ -208,6 +211,7 @@ __all__ = [
     "rollout",
     "rope",
     "rope_along",
+    "same_folds",
     "save_mjcf",
     "save_plan",
     "score",
@@ -218,6 +222,7 @@ __all__ = [
     "simplify_batch",
     "simulate_recordings",
     "skirt",
+    "subgoals",
     "t_shirt",
     "table_with_edge",
     "task_names",
@@ -238,7 +243,7 @@ _ROOMS = {
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
     "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",
-    "goals": "",
+    "goals": "Subgoal find_folds same_folds subgoals",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical Descent Encoding GaussianIndex "
     "Joint Optimum Plan Planner Plans RandomShooting Reranking Sequence make_problem "
     "optimize search_on_host",

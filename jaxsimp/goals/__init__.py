@@ -2,7 +2,7 @@
 
 A goal is an array of positions, shape (N, 3), metres, z up, the table at z = 0. The functions
 here make goals of ropes, cloths and garments; `check_goal` checks any other goal, and `load_goal`
-reads and checks a goal in a file.
+reads and checks a goal in a file; `find_folds` and `subgoals` find the folds of a folded goal.
 """
 
 from jaxsimp.goals.check import as_goal, check_goal
@@ -25,13 +25,16 @@ from jaxsimp.goals.shapes import (
     straight,
     turn,
 )
+from jaxsimp.goals.unfolding import Subgoal, find_folds, same_folds, subgoals, unfolded
 
 __all__ = [
     "Fold",
     "Positions",
+    "Subgoal",
     "as_goal",
     "check_goal",
     "crossed_triangle",
+    "find_folds",
     "flat",
     "fold",
     "fold_sequence",
@@ -42,7 +45,10 @@ __all__ = [
     "load_goal",
     "polyline",
     "rectangle_folds",
+    "same_folds",
     "sleeves_in",
     "straight",
+    "subgoals",
     "turn",
+    "unfolded",
 ]
