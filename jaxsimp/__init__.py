@@ -109,6 +109,7 @@ if TYPE_CHECKING:
         RandomShooting,
         Reranking,
         Sequence,
+        default_algorithm,
         make_problem,
         optimize,
         search_on_host,
@@ -186,6 +187,7 @@ __all__ = [
     "calibration",
     "cloth",
     "compare_with_mjx",
+    "default_algorithm",
     "dynamics",
     "engines",
     "find_folds",
@@ -245,8 +247,8 @@ _ROOMS = {
     "engines.mujoco": "make_model save_mjcf",
     "goals": "Subgoal find_folds same_folds subgoals",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical Descent Encoding GaussianIndex "
-    "Joint Optimum Plan Planner Plans RandomShooting Reranking Sequence make_problem "
-    "optimize search_on_host",
+    "Joint Optimum Plan Planner Plans RandomShooting Reranking Sequence default_algorithm "
+    "make_problem optimize search_on_host",
     "records": "SavedPlan load_plan save_plan",
     "simplification": "METHODS FitStatus KeyPoints Workspace simplify simplify_batch",
     "tasks": "Episode Task make_task register score task_names",

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from jaxsimp.bodies import Body
 from jaxsimp.bodies.material import PARAMETERS
 from jaxsimp.checks import (
+    keep,
     require_choice,
     require_count,
     require_ids,
@@ -97,7 +98,7 @@ class CalibrationConfig:
             )
         for name in self.parameters:
             require_choice("a name in parameters", name, PARAMETERS)
-        object.__setattr__(self, "parameters", tuple(self.parameters))  # hashed, when compiled
+        keep(self, parameters=tuple(self.parameters))  # hashed, when compiled
         require_count("steps", self.steps, 1, 1_000_000)
         require_number("learning_rate", self.learning_rate, 1e-6, 10.0)
         require_number("largest_factor", self.largest_factor, 1.001, 1e6)

@@ -30,6 +30,12 @@ def require_count(name: str, value: object, least: int, most: int = MOST) -> int
     return whole
 
 
+def keep(settings: Any, **values: object) -> None:
+    """Set fields of frozen settings to what a check returned, as plain numbers."""
+    for name, value in values.items():
+        object.__setattr__(settings, name, value)
+
+
 def require_seed(value: object) -> int:
     """A seed: a whole number of 32 bits, of which JAX and NumPy both use every bit.
 

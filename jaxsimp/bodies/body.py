@@ -19,6 +19,7 @@ from jaxsimp.bodies.size import LARGEST, MOST_PARTICLES, require_size
 from jaxsimp.bodies.topology import distinct_edges
 from jaxsimp.checks import (
     as_reals,
+    keep,
     require_count,
     require_ids,
     require_numbers,
@@ -87,7 +88,7 @@ class Body:
         for name in (*_FLOATS, "springs", "families", "faces"):
             own = _own(name, getattr(self, name))
             own.flags.writeable = False
-            object.__setattr__(self, name, own)
+            keep(self, **{name: own})
         _check_shapes(self)
         if self.num_particles > 1 and np.isfinite(self.rest).all():
             require_size(f"the largest extent of the {self.name}", self.size)

@@ -7,7 +7,7 @@ calibrations can fit it and ensembles can vary it.
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 
-from jaxsimp.checks import require_number
+from jaxsimp.checks import keep, require_number
 
 FAMILIES = ("stretch_stiffness", "shear_stiffness", "bend_stiffness")
 """Families of springs, by the name of their stiffness; `Body.families` holds indices into this."""
@@ -64,7 +64,7 @@ class Material:
 
     def __post_init__(self) -> None:
         for name, limits in LIMITS.items():  # plain floats: others round what is made of them
-            object.__setattr__(self, name, require_number(name, getattr(self, name), *limits))
+            keep(self, **{name: require_number(name, getattr(self, name), *limits)})
 
     def changed(self, **values: float) -> "Material":
         """The material with other values of some parameters.

@@ -19,10 +19,10 @@ from jaxsimp.tasks.episode import require_episode
 def plan_cost(
     task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
 ) -> Float[Array, ""]:
-    """Cost of a plan: the sum of the running costs of its actions and the terminal cost.
+    """Cost of a plan: the weighted sum of the running costs of its actions, and the terminal cost.
 
     The terminal cost is that of the state one action's duration after the pickers have let go.
-    The paper sums the same cost over all steps (section IV-A).
+    The paper sums the same cost over all steps (section IV-A), with `Task.running_weight` 1.
 
     Raises:
         ValueError: if the plan is not of the body, see `jaxsimp.dynamics.Actions`.
@@ -40,6 +40,9 @@ def plan_cost(
     costs = running
     if terminal:
         costs = jnp.concatenate([running[..., :-1], terminal[0][..., -1:]], axis=-1)
+    if task.running_weight != 1:
+        weights = np.append(np.full(actions.pick.shape[0], task.running_weight), 1.0)
+        costs = costs * np.broadcast_to(weights.astype(costs.dtype), costs.shape)
     return engine.risk(costs.sum(axis=-1))
 
 

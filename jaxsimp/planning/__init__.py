@@ -7,6 +7,7 @@ A *problem* gives the cost of plans; an *algorithm*, one file each, asks for cos
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Defaults, Sequence, Told, Wants, price
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.cem import CEM
+from jaxsimp.planning.default import default_algorithm
 from jaxsimp.planning.descent import Descent
 from jaxsimp.planning.encodings import ENCODINGS, Categorical, Encoding, GaussianIndex, Joint
 from jaxsimp.planning.host import search_on_host
@@ -43,6 +44,7 @@ __all__ = [
     "Told",
     "Wants",
     "action_space",
+    "default_algorithm",
     "make_problem",
     "optimize",
     "price",

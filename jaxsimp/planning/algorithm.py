@@ -13,18 +13,24 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from jaxsimp.checks import keep
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 
-Wants = Literal["cost", "gradient", "settled"]
-"""Kind of evaluation that an algorithm asks for: the cost of a plan; the cost and its gradient; or
-1 minus the score of the settled state, in the evaluator's physics."""
+Wants = Literal["cost", "gradient", "settled", "screened"]
+"""Kind of evaluation that an algorithm asks for:
+
+- cost: the cost of a plan, in the engine's physics;
+- gradient: that, and its gradient;
+- settled: 1 minus the score of the settled state, in the evaluator's physics;
+- screened: the cost in two fidelities, see `jaxsimp.planning.screening`."""
 
 MOST_PLANS = 1_000_000
 """Most plans in a question, and most questions."""
-PRICES: dict[Wants, int] = {"cost": 1, "gradient": 6, "settled": 4}
+PRICES: dict[Wants, int] = {"cost": 1, "gradient": 6, "settled": 4, "screened": 2}
 """Price of one evaluation by its kind, in rollouts. Measured without self-contact on a CPU: a
-gradient takes the time of 4.7 to 6 rollouts, a rollout with self-contact that of about 4."""
+gradient takes the time of 4.7 to 6 rollouts, a rollout with self-contact that of about 4, and a
+quarter of the plans that are screened are carried out with it."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["costs", "gradients"], meta_fields=[])
@@ -96,12 +102,6 @@ class Algorithm(Protocol):
         ...
 
 
-def keep(settings: Any, **numbers: float) -> None:
-    """Set numbers of frozen settings as plain ones: settings are keys of what is compiled."""
-    for name, number in numbers.items():
-        object.__setattr__(settings, name, number)
-
-
 class Defaults:
     """Defaults of most algorithms: they want costs, and return the best plan."""
 
@@ -132,7 +132,7 @@ class Sequence:
 
     def __post_init__(self) -> None:
         if isinstance(self.algorithms, list):  # algorithms are keys of what is compiled
-            object.__setattr__(self, "algorithms", tuple(self.algorithms))
+            keep(self, algorithms=tuple(self.algorithms))
         if not isinstance(self.algorithms, tuple) or not self.algorithms:
             raise ValueError(f"algorithms is {self.algorithms!r}; give a tuple of at least one")
         for each in self.algorithms:

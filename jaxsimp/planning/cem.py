@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from jaxsimp.checks import require_choice, require_count, require_flag, require_number
-from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, keep
+from jaxsimp.checks import keep, require_choice, require_count, require_flag, require_number
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, Wants
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.encodings import Categorical, Encoding
 from jaxsimp.planning.space import ActionSpace, Plans
@@ -60,6 +60,7 @@ class CEM(Defaults):
         keep_best: whether the best plan so far joins the elites of each round.
         returns: "best", the best plan drawn, or "mean", the mean of the last distribution.
         encoding: encoding of plans as samples of a distribution.
+        wants: "cost", or "screened" for costs in two fidelities.
 
     Raises:
         ValueError: if a number is out of its range.
@@ -74,6 +75,7 @@ class CEM(Defaults):
     keep_best: bool = True
     returns: Literal["best", "mean"] = "best"
     encoding: Encoding = field(default_factory=Categorical)
+    wants: Wants = "cost"
 
     def __post_init__(self) -> None:
         for name in ("num_iterations", "population", "initial_populations"):
@@ -88,6 +90,7 @@ class CEM(Defaults):
         )
         require_flag("keep_best", self.keep_best)
         require_choice("returns", self.returns, ("best", "mean"))
+        require_choice("wants", self.wants, ("cost", "screened"))
         if isinstance(self.encoding, type) or not isinstance(self.encoding, Encoding):
             raise ValueError(
                 f"encoding is {self.encoding!r}; give Categorical(), Joint() or GaussianIndex()"

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray, PyTree
 
-from jaxsimp.checks import require_count, require_number
-from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, Wants, keep
+from jaxsimp.checks import keep, require_count, require_number
+from jaxsimp.planning.algorithm import MOST_PLANS, Defaults, Told, Wants
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.space import ActionSpace, Plans
 

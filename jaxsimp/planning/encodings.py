@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from jaxsimp.checks import require_number
-from jaxsimp.planning.algorithm import keep
+from jaxsimp.checks import keep, require_number
 from jaxsimp.planning.space import ActionSpace, Plans
 
 

@@ -19,6 +19,7 @@ from jaxsimp.dynamics import Actions
 from jaxsimp.planning.algorithm import Algorithm, Sequence, Told, Wants, stages
 from jaxsimp.planning.archive import Archive, archived, empty_archive
 from jaxsimp.planning.problem import Problem
+from jaxsimp.planning.screening import screened
 from jaxsimp.planning.space import ActionSpace, Plans
 
 
@@ -105,11 +106,11 @@ def optimize(
     def run_stage(
         stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: Keys
     ) -> tuple[Progress, Actions, Recorded]:
-        evaluate = evaluation(problem, stage.wants)
+        evaluate = partial(_population, problem, stage.wants, batch)
 
         def exchange(progress: Progress, key: PRNGKeyArray) -> tuple[Progress, Recorded]:
             progress, plans, actions = ask(stage, space, progress, key)
-            return absorb(stage, space, progress, plans, _mapped(evaluate, actions, batch))
+            return absorb(stage, space, progress, plans, evaluate(actions))
 
         first = begin(stage, space, archive, failed)
         progress, recorded = jax.lax.scan(exchange, first, keys)
@@ -215,9 +216,14 @@ def finite(told: Told) -> Told:
 
 
 def evaluation(problem: Problem, wants: Wants) -> Callable[[Actions], Told]:
-    """Function that evaluates one plan as wanted; gradients are by its displacements."""
+    """Function that evaluates one plan as wanted; gradients are by its displacements.
+
+    For "screened" that is the second look at one of the best plans.
+    """
     if wants == "cost":
         return lambda actions: Told(problem.cost(actions))
+    if wants == "screened":
+        return lambda actions: Told(problem.evaluator_cost(actions))
     if wants == "settled":
         return lambda actions: Told(problem.settled_cost(actions))
 
@@ -227,7 +233,15 @@ def evaluation(problem: Problem, wants: Wants) -> Callable[[Actions], Told]:
     return lambda actions: Told(*jax.value_and_grad(cost)(actions.displacement, actions.pick))
 
 
-def _mapped(evaluate: Callable[[Actions], Told], plans: Actions, batch: int | None) -> Told:
+def _population(problem: Problem, wants: Wants, batch: int | None, plans: Actions) -> Told:
+    """Evaluate a population as wanted."""
+    mapped = partial(_mapped, evaluation(problem, wants), batch=batch)
+    if wants != "screened":
+        return mapped(plans)
+    return screened(partial(_mapped, evaluation(problem, "cost"), batch=batch), mapped, plans)
+
+
+def _mapped(evaluate: Callable[[Actions], Told], plans: Actions, *, batch: int | None) -> Told:
     """Evaluate plans along a first axis."""
     if batch is None:
         return jax.vmap(evaluate)(plans)

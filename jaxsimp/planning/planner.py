@@ -25,10 +25,11 @@ from jaxsimp.engines import (
 )
 from jaxsimp.engines.rollouts import as_float, require_plan
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence, Told, Wants, stages
-from jaxsimp.planning.cem import CEM
+from jaxsimp.planning.default import default_algorithm
 from jaxsimp.planning.host import compiled_exchanges, search_on_host
 from jaxsimp.planning.loop import Optimum, archive_size, evaluation
 from jaxsimp.planning.problem import Candidates, TaskProblem, action_space, make_problem
+from jaxsimp.planning.screening import num_again, screened
 from jaxsimp.planning.space import ActionSpace
 from jaxsimp.tasks import Episode, Task
 from jaxsimp.tasks.episode import require_episode
@@ -116,7 +117,8 @@ class Planner:
         Args:
             episode: start and goal.
             candidates: particles that a picker may grasp: key points, ids, or a mask.
-            algorithm: algorithm of the search, or a sequence of algorithms; `CEM()` by default.
+            algorithm: algorithm of the search, or a sequence of algorithms; by default
+                `default_algorithm`, without its reranking if the evaluator is not in JAX.
             seed: seed of the random draws.
             on_ask: function called after each question of the algorithm.
 
@@ -125,7 +127,10 @@ class Planner:
                 body, the seed is none, or the algorithm asks for settled scores and the evaluator
                 is not an engine in JAX.
         """
-        algorithm, seed = algorithm or CEM(), require_seed(seed)
+        if algorithm is None:
+            reranks = isinstance(self.evaluator, SearchEngine)
+            algorithm = default_algorithm(self.task, reranks=reranks)
+        seed = require_seed(seed)
         episode = require_episode(episode, self.task.body.num_particles)
         space = action_space(self.task, candidates)
         compile_seconds = self.prepare(algorithm, space)
@@ -155,7 +160,8 @@ class Planner:
         """
         start = time.perf_counter()
         for stage in stages(algorithm):
-            self._evaluation(stage.wants, stage.num_plans)
+            for wants, size in _evaluations(stage):
+                self._evaluation(wants, size)
             if space is not None:
                 compiled_exchanges(stage, space, archive_size(algorithm))
         return time.perf_counter() - start
@@ -214,6 +220,16 @@ class Planner:
 
     def _told(self, episode: Episode, wants: Wants, actions: Actions, size: int) -> Told:
         """Evaluate at most `size` plans on all cores."""
+        if wants == "screened":
+            return screened(
+                lambda all_plans: self._told(episode, "cost", all_plans, size),
+                lambda best: self._look(episode, "screened", best, num_again(size)),
+                actions,
+            )
+        return self._look(episode, wants, actions, size)
+
+    def _look(self, episode: Episode, wants: Wants, actions: Actions, size: int) -> Told:
+        """Evaluate at most `size` plans in one fidelity."""
         problem, evaluate = self._evaluation(wants, size)
         return evaluate(dataclasses.replace(problem, episode=episode), actions)
 
@@ -225,7 +241,8 @@ class Planner:
         """
         key = wants, size
         if key not in self._maps:
-            problem = self._settled_problem if wants == "settled" else self._problem
+            in_evaluator = wants in ("settled", "screened")
+            problem = self._evaluator_problem if in_evaluator else self._problem
             self._maps[key] = problem, self._compiled(problem, wants, size)
         return self._maps[key]
 
@@ -237,18 +254,20 @@ class Planner:
 
     def layout_of(self, algorithm: Algorithm) -> Layout:
         """Layout of an algorithm's questions on this machine."""
-        problem, _ = self._evaluation(algorithm.wants, algorithm.num_plans)
-        return self._layout(problem, algorithm.wants, algorithm.num_plans)
+        wants, size = _evaluations(algorithm)[0]
+        problem, _ = self._evaluation(wants, size)
+        return self._layout(problem, wants, size)
 
     def _layout(self, problem: TaskProblem, wants: Wants, size: int) -> Layout:
         return self.layout or default_layout(size, problem.chunk_size(wants))
 
     @cached_property
-    def _settled_problem(self) -> TaskProblem:
+    def _evaluator_problem(self) -> TaskProblem:
         if not isinstance(self.evaluator, SearchEngine):
             raise ValueError(
-                f"the algorithm asks for settled scores and the evaluator is {self.evaluator}, no "
-                f"engine in JAX; give another evaluator, as MassSprings(self_contact=True)"
+                f"the algorithm asks for settled scores or screened costs and the evaluator "
+                f"is {self.evaluator}, no engine in JAX; give another evaluator, as "
+                f"MassSprings(self_contact=True)"
             )
         return self._host_problem(self.evaluator)
 
@@ -268,8 +287,14 @@ def _is_object(given: object) -> bool:
 
 def _largest_population(algorithm: Algorithm | Sequence) -> int:
     """Largest number of plans in a question for costs; 1 if the algorithm asks for none."""
-    wanted = [stage.num_plans for stage in stages(algorithm) if stage.wants == "cost"]
-    return max(wanted, default=1)
+    asked = [each for stage in stages(algorithm) for each in _evaluations(stage)]
+    return max((size for wants, size in asked if wants == "cost"), default=1)
+
+
+def _evaluations(algorithm: Algorithm) -> list[tuple[Wants, int]]:
+    """Kinds and sizes of the evaluations that a question takes, in order."""
+    wants, size = algorithm.wants, algorithm.num_plans
+    return [("cost", size), (wants, num_again(size))] if wants == "screened" else [(wants, size)]
 
 
 def _evaluate(wants: Wants, problem: TaskProblem, actions: Actions) -> Told:
@@ -296,7 +321,8 @@ class _Bill:
 
     def __call__(self, wants: Wants, actions: Actions) -> Told:
         """Evaluate plans."""
-        self.num_plans += len(actions.pick)
+        again = num_again(len(actions.pick)) if wants == "screened" else 0
+        self.num_plans += len(actions.pick) + again
         self.price += PRICES[wants] * len(actions.pick)
         is_one_cost = wants == "cost" and len(actions.pick) == 1
         return self._evaluate(

@@ -38,10 +38,14 @@ class Problem(Protocol):
         """Cost of the settled state after a plan; only called if an algorithm wants it."""
         ...
 
+    def evaluator_cost(self, actions: Actions) -> Float[Array, ""]:
+        """Cost of a plan in a dearer fidelity; only called if an algorithm wants it."""
+        ...
+
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["space", "episode", "physics", "settled_physics"],
+    data_fields=["space", "episode", "physics", "evaluator_physics"],
     meta_fields=["task", "engine", "evaluator"],
 )
 @dataclass(frozen=True, eq=False)
@@ -54,16 +58,16 @@ class TaskProblem:
         space: space of plans to search.
         episode: start and goal.
         physics: physics of the engine.
-        settled_physics: physics of the evaluator.
+        evaluator_physics: physics of the evaluator.
         task: the task; static.
         engine: engine that gives the costs of plans; static.
-        evaluator: engine that scores settled states, for algorithms that ask for them; static.
+        evaluator: engine for algorithms that ask for settled scores or screened costs; static.
     """
 
     space: ActionSpace
     episode: Episode
     physics: PyTree[Any]
-    settled_physics: PyTree[Any]
+    evaluator_physics: PyTree[Any]
     task: Task
     engine: SearchEngine
     evaluator: SearchEngine | None
@@ -78,20 +82,32 @@ class TaskProblem:
         Raises:
             ValueError: if the problem has no evaluator.
         """
-        if self.evaluator is None:
-            raise ValueError(
-                "the algorithm asks for settled scores and the problem has no evaluator; give "
-                "`make_problem` one, as MassSprings(self_contact=True)"
-            )
         return 1.0 - settled_score(
-            self.task, self.evaluator, self.settled_physics, self.episode, actions
+            self.task, self._evaluator, self.evaluator_physics, self.episode, actions
         )
+
+    def evaluator_cost(self, actions: Actions) -> Float[Array, ""]:
+        """Cost of a plan in the physics of the evaluator, see `plan_cost`.
+
+        Raises:
+            ValueError: if the problem has no evaluator.
+        """
+        return plan_cost(self.task, self._evaluator, self.evaluator_physics, self.episode, actions)
 
     def chunk_size(self, wants: Wants) -> int:
         """Fastest number of plans under one `vmap` on a core of a CPU."""
-        if wants == "settled" and self.evaluator is not None:
-            return self.evaluator.chunk_size(self.settled_physics)
+        if wants in ("settled", "screened"):
+            return self._evaluator.chunk_size(self.evaluator_physics)
         return self.engine.chunk_size(self.physics)
+
+    @property
+    def _evaluator(self) -> SearchEngine:
+        if self.evaluator is None:
+            raise ValueError(
+                "the algorithm asks for an evaluator's physics and the problem has no evaluator; "
+                "give `make_problem` one, as MassSprings(self_contact=True)"
+            )
+        return self.evaluator
 
 
 def make_problem(
@@ -109,7 +125,7 @@ def make_problem(
         episode: start and goal; those of seed 0 by default.
         engine: engine that gives the costs of plans; by default our own dynamics, without
             self-contact.
-        evaluator: engine that scores settled states; needed by algorithms that ask for them.
+        evaluator: engine for algorithms that ask for settled scores or screened costs.
 
     Raises:
         ValueError: if a candidate is not a particle of the body, the episode is not of the body,
@@ -122,7 +138,7 @@ def make_problem(
         space=action_space(task, candidates),
         episode=jax.tree.map(partial(jnp.asarray, dtype=float), episode),
         physics=engine.physics(task),
-        settled_physics=evaluator.physics(task) if evaluator else (),
+        evaluator_physics=evaluator.physics(task) if evaluator else (),
         task=task,
         engine=engine,
         evaluator=evaluator,

@@ -94,6 +94,8 @@ class SavedPlan:
             settings = {each: told[each] for each in SETTINGS} | {
                 "limits": tuple(told["limits"]),
                 "longest_time_step": told["time_step"],
+                # Files of before 0.2 have none: their costs were summed alike.
+                "running_weight": told.get("running_weight", 1.0),
                 "episode_fn": FixedStart(self.episode),
                 "obstacles": _obstacles(told),
             }
@@ -280,6 +282,7 @@ def _task_text(task: Task) -> dict[str, Any]:
         "name": task.name,
         "resolution": task.resolution,
         **{name: getattr(task, name) for name in SETTINGS},
+        "running_weight": task.running_weight,
         "time_step": task.time_step,
         "obstacles": [
             {"shape": type(obstacle).__name__}

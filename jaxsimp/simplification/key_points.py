@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsimp.checks import require_ids
+from jaxsimp.checks import keep, require_ids
 
 
 class FitStatus(IntEnum):
@@ -75,7 +75,7 @@ class KeyPoints:
         for name in ("particles", "positions", "elements"):
             own = np.array(getattr(self, name))
             own.flags.writeable = False
-            object.__setattr__(self, name, own)
+            keep(self, **{name: own})
 
     def __reduce__(self) -> tuple[type["KeyPoints"], tuple[Any, ...]]:
         """Make copies with the constructor, since pickled arrays lose their read-only flag."""

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions, State
-from jaxsimp.tasks.costs import distance, distance_cost
+from jaxsimp.tasks.costs import RUNNING_WEIGHT, distance, distance_cost
 from jaxsimp.tasks.episode import Episode
 from jaxsimp.tasks.registry import register
 from jaxsimp.tasks.starts import TurnedStart
@@ -84,6 +84,7 @@ def _fold_task(
         draw_fn=start.draw,
         running_cost=cost,
         terminal_cost=cost,
+        running_weight=RUNNING_WEIGHT,
         limits=(0.2, 0.2, 0.2),
         num_actions=2,
         action_seconds=0.25,
@@ -126,6 +127,7 @@ def flat_task(body: Body, goal: goals.Positions, num_actions: int) -> Task:
         draw_fn=start.draw,
         running_cost=distance_cost,
         terminal_cost=distance_cost,
+        running_weight=RUNNING_WEIGHT,
         limits=(0.2, 0.2, 0.2),
         num_actions=num_actions,
         action_seconds=0.25,

@@ -15,6 +15,10 @@ from jaxsimp.checks import require_count
 from jaxsimp.dynamics import Actions, State
 from jaxsimp.tasks.episode import Episode
 
+RUNNING_WEIGHT = 0.3
+"""Weight of the running costs of our tasks. With 1, the paper's sum, plans that take the way of
+lowest cost win over those of the best end; with 0 nothing tells a search which first actions are
+promising."""
 MATCHED_PARTICLES = 11
 """Number of particles that `MatchingCost` compares; SoftGym chooses 10."""
 

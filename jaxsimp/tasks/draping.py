@@ -5,7 +5,7 @@ import numpy as np
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Capsule, Table, least_radius
-from jaxsimp.tasks.costs import distance_cost
+from jaxsimp.tasks.costs import RUNNING_WEIGHT, distance_cost
 from jaxsimp.tasks.episode import Episode
 from jaxsimp.tasks.registry import register
 from jaxsimp.tasks.starts import FixedStart
@@ -37,6 +37,7 @@ def towel_over_bar(resolution: int) -> Task:
         draw_fn=start.draw,
         running_cost=distance_cost,
         terminal_cost=distance_cost,
+        running_weight=RUNNING_WEIGHT,
         limits=(0.25, 0.1, 0.4),
         num_actions=3,
         action_seconds=0.5,

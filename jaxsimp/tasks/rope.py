@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from jaxsimp import goals
 from jaxsimp.bodies import Body, rope
 from jaxsimp.dynamics import Actions, State
-from jaxsimp.tasks.costs import MatchingCost, distance, distance_cost
+from jaxsimp.tasks.costs import RUNNING_WEIGHT, MatchingCost, distance, distance_cost
 from jaxsimp.tasks.episode import Episode
 from jaxsimp.tasks.registry import register
 from jaxsimp.tasks.starts import CrumpledStart, FixedStart
@@ -45,6 +45,7 @@ def rope_straightening(resolution: int) -> Task:
         episode_fn=CrumpledStart(body, goal),
         running_cost=ends_cost,
         terminal_cost=ends_cost,
+        running_weight=RUNNING_WEIGHT,
     )
 
 
@@ -69,6 +70,7 @@ def rope_folding(resolution: int) -> Task:
         draw_fn=start.draw,
         running_cost=cost,
         terminal_cost=cost,
+        running_weight=RUNNING_WEIGHT,
     )
 
 
@@ -104,5 +106,6 @@ def _shape_task(body: Body, goal: goals.Positions) -> Task:
         draw_fn=start.draw,
         running_cost=distance_cost,
         terminal_cost=distance_cost,
+        running_weight=RUNNING_WEIGHT,
         num_actions=6,
     )

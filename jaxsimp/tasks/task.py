@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
-from jaxsimp.checks import require_count, require_number
+from jaxsimp.checks import keep, require_count, require_number
 from jaxsimp.dynamics import (
     Obstacle,
     Pickers,
@@ -59,6 +59,8 @@ class Task:
         settle_actions: time with nothing held, between the last action and the score, in multiples
             of `action_seconds`.
         longest_time_step: upper bound on the time step of the simulation, seconds.
+        running_weight: weight of the running costs in the cost of a plan, in which the terminal
+            cost counts once; 1 for the paper's sum.
         obstacles: rigid bodies at rest, in the order in which they act.
         draw_fn: function from a key to an episode, in pure JAX; None if `episode_fn` alone makes
             episodes.
@@ -83,6 +85,7 @@ class Task:
     action_seconds: float = 0.3
     settle_actions: int = 4
     longest_time_step: float = 2e-3
+    running_weight: float = 1.0
     obstacles: tuple[Obstacle, ...] = (Table(),)
     draw_fn: DrawFn | None = None
     name: str = "unnamed"
@@ -91,15 +94,17 @@ class Task:
     def __post_init__(self) -> None:
         check_obstacles(self.obstacles, self.body)
         goals.check_goal(self.body, self.goal, has_table=has_table(self.obstacles))
-        own: dict[str, object] = {"limits": require_limits(self.limits)}
+        own: dict[str, object] = {
+            "limits": require_limits(self.limits),
+            "running_weight": require_number("running_weight", self.running_weight, 0.0, 1e6),
+        }
         if not isinstance(self.name, str):
             raise ValueError(f"name is {self.name!r}; give a text")
         for name, counts in COUNTS.items():
             own[name] = require_count(name, getattr(self, name), *counts)
         for name, seconds in SECONDS.items():
             own[name] = require_number(name, getattr(self, name), *seconds, "s")
-        for name, plain in own.items():  # plan files hold plain numbers
-            object.__setattr__(self, name, plain)
+        keep(self, **own)  # plan files hold plain numbers
         check_costs(
             self.running_cost, self.terminal_cost, self.body.num_particles, self.num_pickers
         )

@@ -22,11 +22,13 @@ def height(episode, state):
     return 100.0 + state.position[:, 2].mean()
 
 
-def test_a_plan_costs_its_actions_and_the_state_that_it_leaves():
+@pytest.mark.parametrize("weight", [1.0, 0.3, 0.0])
+def test_a_plan_costs_its_actions_and_the_state_that_it_leaves(weight):
     task = dataclasses.replace(
         make_task("rope_letter_u", 7),
         running_cost=effort,
         terminal_cost=height,
+        running_weight=weight,
         num_actions=2,
         action_seconds=0.1,
     )
@@ -40,7 +42,7 @@ def test_a_plan_costs_its_actions_and_the_state_that_it_leaves():
     ways = np.abs(np.asarray(actions.displacement, float)).sum(axis=(1, 2))
     left = 100.0 + np.asarray(states.position[2, :, 2], float).mean()
     # float32 of a number of 100
-    np.testing.assert_allclose(found, sum(speeds[:2]) + ways.sum() + left, atol=3e-5)
+    np.testing.assert_allclose(found, weight * (sum(speeds[:2]) + ways.sum()) + left, atol=3e-5)
     assert speeds[2] > 1e-3  # the action with nothing held has no running cost
 
 

@@ -31,6 +31,7 @@ from jaxsimp.planning import (
 )
 from jaxsimp.planning.algorithm import stages
 from jaxsimp.planning.loop import evaluation
+from jaxsimp.planning.screening import num_again, screened
 from jaxsimp.tasks import make_task
 
 CANDIDATES = [3, 11, 42, 7]
@@ -65,6 +66,9 @@ class Quadratic:
         off = actions.displacement[..., 0] / self.space.limits[0] - self.move[..., 0]
         return 0.01 * jnp.abs(off).sum()  # below all costs
 
+    def evaluator_cost(self, actions: Actions) -> Array:
+        return 0.5 + 2 * self.cost(actions)
+
 
 def quadratic(shift: float = 0.0, **options) -> Quadratic:
     limits = jnp.asarray(LIMITS, dtype=float)
@@ -77,7 +81,10 @@ def on_host(problem, algorithm, key=0, asked=None):
     jitted = {wants: jax.jit(jax.vmap(evaluation(problem, wants))) for wants in PRICES}
 
     def evaluate(wants, actions):
-        told = jitted[wants](actions)
+        if wants == "screened":
+            told = screened(jitted["cost"], jitted["screened"], actions)
+        else:
+            told = jitted[wants](actions)
         if asked is not None:
             asked.append((wants, actions, np.asarray(told.costs)))
         return told
@@ -89,6 +96,7 @@ SHORT = CEM(num_iterations=4, population=24, initial_populations=2)
 ALGORITHMS = {
     **{name: dataclasses.replace(SHORT, encoding=each) for name, each in ENCODINGS.items()},
     "mean": dataclasses.replace(SHORT, returns="mean"),
+    "screened": dataclasses.replace(SHORT, wants="screened"),
     "random shooting": RandomShooting(num_asks=5, num_plans=24),
     "descent": Sequence((SHORT, Descent(num_asks=8, num_starts=3))),
     "reranking": Sequence((SHORT, Reranking(num_starts=4))),
@@ -115,7 +123,9 @@ def test_a_search_is_seeded_improves_and_tells_what_it_returns(algorithm):
     assert np.any(on_host(problem, algorithm, 2).best_costs != found.best_costs)
     assert np.all(np.diff(found.best_costs) <= 0)
     assert found.best_costs[-1] < found.best_costs[0]
-    assert found.cost == pytest.approx(float(problem.cost(found.actions)), rel=1e-6)
+    screens = getattr(algorithm, "wants", "") == "screened"
+    cost = problem.evaluator_cost if screens else problem.cost
+    assert found.cost == pytest.approx(float(cost(found.actions)), rel=1e-6)
     assert set(np.asarray(found.actions.pick).ravel().tolist()) <= {*CANDIDATES, NONE}
     assert np.all(np.abs(found.actions.displacement) <= LIMITS.astype(np.float32))
     # A question each, then perhaps the cost of what is returned.
@@ -318,6 +328,39 @@ def test_reranking_returns_what_settles_best_of_the_best_plans():
     np.testing.assert_allclose(found.archive.costs, archived, rtol=1e-6)  # float32
     assert found.cost == pytest.approx(float(quadratic().cost(found.actions)), rel=1e-6)
     assert found.cost >= alone.cost
+
+
+@pytest.mark.parametrize("size", [1, 4, 10])
+def test_screening_ranks_the_best_by_their_second_look_and_all_others_behind(size):
+    rng = np.random.default_rng(size)
+    cheap, dear = rng.permutation(size).astype(float), rng.permutation(size) + 3.0
+    cheap[rng.integers(size)] = np.inf if size > 4 else 0.0
+    looked = []
+
+    def by_name(costs):
+        def told(actions):
+            names = np.asarray(actions.pick)[:, 0, 0]
+            looked.append(names.tolist())
+            return Told(costs[names])
+
+        return told
+
+    picks = np.broadcast_to(np.arange(size)[:, None, None], (size, 2, 2))
+    plans = Actions(jnp.asarray(picks), jnp.zeros((size, 2, 2, 3)))
+    costs = np.asarray(screened(by_name(cheap), by_name(dear), plans).costs)
+    again = np.argsort(cheap, kind="stable")[: num_again(size)]
+    assert looked == [list(range(size)), again.tolist()]
+    assert len(again) == max(1, -(-size // 4))
+    np.testing.assert_array_equal(costs[again], dear[again])
+    others = np.delete(np.arange(size), again)
+    np.testing.assert_array_equal(costs[others], cheap[others] + dear[again].max())
+
+
+def test_a_second_look_that_fails_ranks_last_and_hides_no_other():
+    plans = Actions(jnp.zeros((8, 2, 2), int), jnp.zeros((8, 2, 2, 3)))
+    cheap = Told(jnp.arange(8.0))
+    found = screened(lambda _: cheap, lambda _: Told(jnp.array([jnp.nan, 5.0])), plans)
+    np.testing.assert_array_equal(found.costs, [np.nan, 5, 7, 8, 9, 10, 11, 12])
 
 
 def test_algorithms_of_a_sequence_draw_by_themselves():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxsimp.dynamics import NONE, Actions, at_rest, make_pickers, rollout, settle
-from jaxsimp.engines import Layout, MassSprings
+from jaxsimp.engines import Layout, MassSprings, MuJoCo, make_ensemble
 from jaxsimp.planning import (
     CEM,
     ENCODINGS,
@@ -22,6 +22,7 @@ from jaxsimp.planning import (
     Planner,
     Reranking,
     Sequence,
+    default_algorithm,
     host,
     make_problem,
     optimize,
@@ -185,6 +186,7 @@ def test_the_cost_of_a_plan_is_that_of_an_independent_rollout(returns):
     frames = independent_frames(plan.actions)
     steps = [float(task.terminal_cost(episode, at_rest(frame))) for frame in frames[1:-1]]
     assert len(steps) == 3  # two actions, and the state that is left
+    steps[:2] = [task.running_weight * step for step in steps[:2]]
     # rounding of other machine code, see test_layouts_agree_on_the_costs
     assert plan.optimum.cost == pytest.approx(sum(steps), rel=1e-4)
     assert plan.num_rollouts == plan.price == 12 + (returns == "mean")
@@ -257,10 +259,54 @@ def test_what_a_sequence_costs_adds_up_and_is_compiled_once(monkeypatch):
     assert host._compile.cache_info().misses == exchanges
 
 
-def test_settled_scores_need_an_evaluator():
+def test_an_evaluators_physics_needs_an_evaluator():
     alone = make_problem(small_task(), CANDIDATES)
-    with pytest.raises(ValueError, match=r"problem has no evaluator; give `make_problem` one"):
-        optimize(alone, Reranking(2), jax.random.key(0))
+    for algorithm in (Reranking(2), dataclasses.replace(ALGORITHM, wants="screened")):
+        with pytest.raises(ValueError, match=r"problem has no evaluator; give `make_problem` one"):
+            optimize(alone, algorithm, jax.random.key(0))
+
+
+def test_screened_costs_are_those_of_the_evaluator_and_are_counted(monkeypatch):
+    # Pure `optimize` gives the same; where all plans are looked at again the engine has no say.
+    task, episode = small_task(), small_task().episode_fn(3)
+    algorithm = dataclasses.replace(ALGORITHM, wants="screened", population=8)
+    ensemble = make_ensemble(task, 2)
+    made = Planner(task, evaluator=ensemble, layout=LAYOUT)
+    plan = made.plan(episode, CANDIDATES, algorithm, 3)
+    assert (plan.num_rollouts, plan.price) == (2 * (8 + 2), 2 * 16)
+    wanted = Planner(task, ensemble, layout=LAYOUT).costs(
+        episode, jax.tree.map(lambda leaf: leaf[None], plan.actions)
+    )
+    assert plan.optimum.cost == pytest.approx(wanted[0], rel=1e-4)  # see the layouts above
+    pure = optimize(
+        make_problem(task, CANDIDATES, episode, evaluator=ensemble), algorithm, jax.random.key(3)
+    )
+    np.testing.assert_allclose(pure.best_costs, plan.optimum.best_costs, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "price_at_most"), [("rope_folding", 2560), ("cloth_side_folding", 1920)]
+)
+def test_the_default_search_keeps_to_its_price(name, price_at_most):
+    task = make_task(name, 5)
+    whole = default_algorithm(task)
+    assert 0.95 * price_at_most < price(whole) < price_at_most
+    assert [type(each) for each in whole.algorithms] == [CEM, Descent, Reranking]
+    assert default_algorithm(task, reranks=False).algorithms == whole.algorithms[:2]
+
+
+def test_a_planner_searches_by_default_with_what_its_evaluator_allows(monkeypatch):
+    monkeypatch.setattr(
+        "jaxsimp.planning.planner.default_algorithm",
+        lambda task, reranks: SEQUENCE if reranks else Sequence(SEQUENCE.algorithms[:2]),
+    )
+    episode = small_task().episode_fn(3)
+    assert_same(
+        planner().plan(episode, CANDIDATES, seed=3),
+        planner().plan(episode, CANDIDATES, SEQUENCE, 3),
+    )
+    made = Planner(small_task(), evaluator=MuJoCo(), layout=LAYOUT)
+    assert made.plan(episode, CANDIDATES, seed=3).price == 12 + 6 * 4
 
 
 def test_float64_plans(x64):

@@ -121,6 +121,7 @@ def test_a_goal_that_does_not_fit_is_refused():
         *(("num_pickers", value, "from 1 to 1000") for value in (0, 1.0, "2")),
         *(("settle_actions", value, "from 0 to 10000") for value in (-2, 0.5)),
         *(("action_seconds", value, "0.0001 to 10000 s") for value in (0.0, -1, np.nan, np.inf)),
+        *(("running_weight", value, "from 0 to 1e") for value in (-0.1, np.nan, "1", 1e9)),
         *(("longest_time_step", value, "1e-06 to 1 s") for value in (0, np.inf, "1", 1j)),
         *(("limits", value, "three displacements in metres") for value in ((0.1, 0.1), 0.1)),
     ],

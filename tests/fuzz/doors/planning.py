@@ -55,6 +55,8 @@ def _is_cem(**given: Any) -> bool | None:
             verdicts.append(is_flag(value))
         elif name == "returns":
             verdicts.append(is_one_of(value, ("best", "mean")))
+        elif name == "wants":
+            verdicts.append(is_one_of(value, ("cost", "screened")))
         elif name == "encoding":
             verdicts.append(isinstance(value, js.Encoding))
         else:
@@ -270,6 +272,7 @@ DOORS = (
             "initial_spread": number(0.1, 2.0),
             "keep_best": flag(),
             "returns": choice("best", "mean"),
+            "wants": choice("cost", "screened"),
             "encoding": Parameter(st.sampled_from(list(js.ENCODINGS.values())), anything),
         },
         _is_cem,

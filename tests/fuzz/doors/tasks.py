@@ -76,6 +76,7 @@ def _is_task(**given: Any) -> bool | None:
         is_count(given.get("settle_actions", 4), 0, 100),
         in_range(given.get("action_seconds", 0.3), 0.05, 10.0, absurd=(1e-12, 1e9)),
         in_range(given.get("longest_time_step", 2e-3), 1e-4, 1.0, absurd=(1e-12, 1e300)),
+        in_range(given.get("running_weight", 1.0), 0.0, 100.0, absurd=(0.0, 1e300)),
         are_obstacles(given.get("obstacles", (js.Table(),))),
         given.get("running_cost", distance_cost) is distance_cost,
         given.get("terminal_cost", distance_cost) is distance_cost,
@@ -157,6 +158,7 @@ DOORS = (
             "settle_actions": count(0, 9),
             "action_seconds": number(0.1, 2.0),
             "longest_time_step": number(5e-4, 1e-2),
+            "running_weight": number(0.0, 2.0),
             "obstacles": Parameter(
                 st.just((js.Table(),)), st.lists(broken | whole, max_size=2) | anything
             ),
