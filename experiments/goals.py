@@ -1,7 +1,7 @@
 """The study of harder goals: `python -m experiments.run goals`."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from experiments.plan_options import PlanOptions
 from jaxsimp.tasks import task_names
@@ -21,5 +21,3 @@ class GoalsOptions(PlanOptions):
     """Tasks to plan for."""
     pick_encodings: tuple[str, ...] = ("joint",)
     """CEM's encoding of the choice of particles."""
-    budget: Literal["default", "paper", "goals"] = "goals"
-    """Search settings: a search of minutes, the paper's settings, or more for several folds."""

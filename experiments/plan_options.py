@@ -8,7 +8,9 @@ from typing import ClassVar, Literal
 
 from rich.console import Console
 
-from experiments.plans import ACTION_SPACES, PlanStudy, run_study
+from experiments.plan_study import ACTION_SPACES, PlanStudy
+from experiments.planners import PLANNERS
+from experiments.plans import run_study
 from experiments.study import default_folder, teller, told_done
 from jaxsimp import records
 from jaxsimp.planning import ENCODINGS
@@ -28,32 +30,35 @@ class PlanOptions:
     """Method of simplification: robust, paper or meshlab."""
     action_spaces: tuple[str, ...] = ACTION_SPACES
     """Action spaces: the particles that a picker may grasp."""
-    pick_encodings: tuple[str, ...] = ("categorical", "gaussian_index")
+    planners: tuple[str, ...] = ("default",)
+    """Planners: default, parts of it (without_descent, without_reranking, cem), cem_24 for that of
+    version 0.1, and paper for the paper's settings."""
+    pick_encodings: tuple[str, ...] = ("joint", "gaussian_index")
     """CEM's encoding of the choice of particles."""
+    first_seed: int = 0
+    """The first seed."""
     seeds: int = 10
-    """Seeds 0 to SEEDS - 1 of each combination."""
+    """Number of seeds of each combination."""
     resolution: int | None = None
     """Particles along the rope or a side of the cloth (default: 41 and 25)."""
-    budget: Literal["default", "paper", "goals"] = "default"
-    """Search settings: a search of minutes, the paper's settings, or more for several folds."""
     num_iterations: int | None = None
-    """Number of CEM rounds, instead of the budget's."""
+    """Number of CEM rounds, instead of the planner's."""
     population: int | None = None
-    """Number of plans per round, instead of the budget's."""
+    """Number of plans per round, instead of the planner's."""
     initial_populations: int | None = None
-    """Number of populations in the first CEM round, instead of the budget's."""
+    """Number of populations in the first CEM round, instead of the planner's."""
     elite_fraction: float | None = None
-    """Fraction of the population that are elites, instead of the budget's."""
+    """Fraction of the population that are elites, instead of the planner's."""
     smoothing: float | None = None
-    """Fraction of the old distribution kept in an update, instead of the budget's."""
+    """Fraction of the old distribution kept in an update, instead of the planner's."""
     initial_spread: float | None = None
-    """First deviation of displacements, in units of the limits, instead of the budget's."""
+    """First deviation of displacements, in units of the limits, instead of the planner's."""
     keep_best: bool | None = None
-    """Whether the best plan so far stays among the elites, instead of the budget's."""
+    """Whether the best plan so far stays among the elites, instead of the planner's."""
     returns: Literal["best", "mean"] | None = None
-    """The best plan drawn, or the mean of the last distribution, instead of the budget's."""
+    """The best plan drawn, or the mean of the last distribution, instead of the planner's."""
     num_actions: int | None = None
-    """Number of actions in a plan (the horizon), instead of the budget's."""
+    """Number of actions in a plan (the horizon), instead of the planner's."""
     planning: Literal["nominal", "robust", "self_contact", "mixed"] = "nominal"
     """Physics of the search: the body's own physics, an ensemble, self-contact, or self-contact for
     cloths and the body's own physics for ropes."""
@@ -66,7 +71,7 @@ class PlanOptions:
     mixed: bool = False
     """Go on in a folder with rows of another environment; the report says so."""
     list: bool = False
-    """List the tasks, action spaces and encodings, and exit."""
+    """List the tasks, planners, action spaces and encodings, and exit."""
 
     def configuration(self) -> PlanStudy:
         """The study of these options.
@@ -85,12 +90,13 @@ class PlanOptions:
             tasks=self.tasks,
             method=self.method,
             success_score=self.SUCCESS_SCORE,
+            planners=self.planners,
             action_spaces=self.action_spaces,
             pick_encodings=self.pick_encodings,
+            first_seed=self.first_seed,
             seeds=min(self.seeds, 2) if self.smoke else self.seeds,
             quick=self.smoke,
             resolution=self.resolution,
-            budget="smoke" if self.smoke else self.budget,
             settings=given,
             num_actions=self.num_actions,
             planning=self.planning,
@@ -98,7 +104,7 @@ class PlanOptions:
         )
 
     def run(self, console: Console) -> None:
-        """Run the study, or list its possible tasks, action spaces and encodings."""
+        """Run the study, or list its possible tasks, planners, action spaces and encodings."""
         if self.list:
             _list(console)
             return
@@ -124,5 +130,6 @@ def _list(console: Console) -> None:
     for name in task_names():
         task = make_task(name)
         console.print(f"task {name}: {task.body.name}, {task.body.num_particles} particles")
+    console.print(f"planners: {', '.join(PLANNERS)}")
     console.print(f"action spaces: {', '.join(ACTION_SPACES)}")
     console.print(f"pick encodings: {', '.join(ENCODINGS)}")

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from experiments.markdown import provenance, save_figure, spread, success_interval, table
-from experiments.plans import IDENTITY, PLANS_FOLDER, ROWS_FILE, PlanStudy, key_points
+from experiments.plan_study import IDENTITY, PlanStudy
+from experiments.plans import PLANS_FOLDER, ROWS_FILE, key_points
 from jaxsimp import records, viz
 
 Rows = list[dict[str, Any]]
@@ -42,7 +43,10 @@ def write_report(
     shown = {name: (task.body, task.goal, models[name]) for name, task in tasks.items()}
     save_figure(viz.plot_models(shown), figures / "models.png")
     save_figure(
-        viz.plot_costs({name: _costs(_of(rows, task=name)) for name in tasks}),
+        viz.plot_costs(
+            {name: _costs(_of(rows, task=name)) for name in tasks},
+            rollouts={name: _rollouts(_of(rows, task=name)) for name in tasks},
+        ),
         figures / "costs.png",
     )
     for name, task in tasks.items():
@@ -82,16 +86,25 @@ def _of(rows: Rows, **fields: Any) -> Rows:
 def _methods(rows: Rows) -> dict[str, Rows]:
     """Rows by method, in the order of the methods' first rows."""
     methods: dict[str, Rows] = defaultdict(list)
+    has_several = len({row["planner"] for row in rows}) > 1
     for row in rows:
         name = f"{LABELS[row['action_space']]}, {LABELS[row['pick_encoding']]}"
-        methods[name].append(row)
+        methods[f"{row['planner']}: {name}" if has_several else name].append(row)
     return methods
 
 
 def _costs(rows: Rows) -> dict[str, np.ndarray]:
     """Cost of the best plan so far, one row per run; NaN before the first finite cost."""
     return {
-        method: np.array([row["cost_per_iteration"] for row in runs], dtype=float)
+        method: np.array([row["cost_per_question"] for row in runs], dtype=float)
+        for method, runs in _methods(rows).items()
+    }
+
+
+def _rollouts(rows: Rows) -> dict[str, np.ndarray]:
+    """Counted rollouts up to each of these costs."""
+    return {
+        method: np.array(runs[0]["rollouts_per_question"], dtype=float)
         for method, runs in _methods(rows).items()
     }
 
@@ -135,7 +148,7 @@ def _report(study: PlanStudy, summary: dict[str, Any], transfer: Rows) -> str:
         "## Simplified models over their goals",
         "![models](figures/models.png)",
         "",
-        "## Cost of the best plan by iteration, mean and 95 % interval over seeds",
+        "## Cost of the best plan by counted rollouts, mean and 95 % interval over seeds",
         "![costs](figures/costs.png)",
         "",
         "## Executed plans",
@@ -201,7 +214,7 @@ def _run_table(rows: Rows, transfer: Rows) -> list[str]:
                     method,
                     spread(scores),
                     f"{successes}/{len(runs)} ({low:.2f} to {high:.2f})",
-                    runs[0]["rollouts"],
+                    runs[0]["counted_rollouts"],
                     sum(run["non_finite"] for run in runs),
                     f"{np.median([run['plan_seconds'] for run in runs]):.1f}",
                     f"{sum(run['compile_seconds'] for run in runs):.1f}",
@@ -214,7 +227,7 @@ def _run_table(rows: Rows, transfer: Rows) -> list[str]:
             "method",
             "score: median (range)",
             "success rate (95 %)",
-            "rollouts a plan",
+            "counted rollouts",
             "not finite",
             "seconds to plan",
             "compile seconds, all runs",

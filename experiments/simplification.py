@@ -30,7 +30,7 @@ from experiments.settled_goals import SETTLED_FOLDS, settled_goal
 from experiments.study import default_folder, teller
 from jaxsimp import records
 from jaxsimp.bodies import Body, cloth, rope
-from jaxsimp.checks import require_count
+from jaxsimp.checks import require_count, require_seed
 from jaxsimp.simplification import METHODS, simplify_batch
 
 ROWS_FILE = "goals.jsonl"
@@ -53,6 +53,7 @@ class SimplificationStudy:
 
     Attributes:
         methods: methods of simplification.
+        first_seed: the first seed.
         seeds: number of draws of noise, gap and rounding for each goal and resolution.
         rope_sizes: numbers of particles along the ropes.
         cloth_sizes: numbers of particles along a side of the cloths.
@@ -60,6 +61,7 @@ class SimplificationStudy:
     """
 
     methods: tuple[str, ...]
+    first_seed: int
     seeds: int
     rope_sizes: tuple[int, ...]
     cloth_sizes: tuple[int, ...]
@@ -72,6 +74,8 @@ class SimplificationStudy:
         if not self.methods:
             raise ValueError(f"no method is given; choose from {', '.join(METHODS)}")
         require_count("seeds", self.seeds, 1)
+        require_seed(self.first_seed)
+        require_seed(self.first_seed + self.seeds - 1)
 
     def identity(self) -> dict[str, Any]:
         """Identity of a folder of results."""
@@ -83,10 +87,10 @@ class SimplificationStudy:
         for kind, names in (("rope", LINES), ("cloth", FOLDS)):
             for size in sizes[kind]:
                 for index, name in enumerate(names):
-                    for seed in range(self.seeds):
+                    for seed in range(self.first_seed, self.first_seed + self.seeds):
                         yield _drawn(kind, name, size, index, seed)
         for name in SETTLED_FOLDS:
-            for seed in range(self.seeds):
+            for seed in range(self.first_seed, self.first_seed + self.seeds):
                 yield Case("settled", name, self.settled_size, "none", 0.0, 0.0, 0.0, seed)
 
 
@@ -208,6 +212,8 @@ class SimplificationOptions:
 
     methods: tuple[str, ...] = available_methods()
     """Methods to compare (default: all, meshlab if its extra is installed)."""
+    first_seed: int = 0
+    """The first seed."""
     seeds: int = 12
     """Number of draws of noise for each goal and resolution."""
     out: Path | None = None
@@ -225,6 +231,7 @@ class SimplificationOptions:
         """
         return SimplificationStudy(
             methods=self.methods,
+            first_seed=self.first_seed,
             seeds=min(self.seeds, 1) if self.smoke else self.seeds,
             rope_sizes=(41,) if self.smoke else (41, 81),
             cloth_sizes=(25,) if self.smoke else (25, 45, 64),

@@ -12,18 +12,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from rich.console import Console
 
 from experiments import plans
 from experiments.plan_options import PlanOptions
+from experiments.plan_study import IDENTITY, PlanStudy, Run
 from experiments.progress import progress_bar
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.study import teller, told_done
 from jaxsimp import records
-from jaxsimp.engines import Execution, MassSprings, MuJoCo, replay
+from jaxsimp.engines import Execution, MuJoCo, replay
 from jaxsimp.engines.mujoco import VARIANTS
 from jaxsimp.tasks import Task, score, task_names
 
@@ -50,7 +51,7 @@ class TransferStudy:
         success_score: smallest settled score of a plan that transfers.
     """
 
-    plans: plans.PlanStudy
+    plans: PlanStudy
     source: str | None
     success_score: float
 
@@ -68,7 +69,8 @@ class TransferStudy:
         """Task and seed of the scripted plans."""
         for name in self.plans.tasks:
             if name in SCRIPTS:
-                yield from ((name, seed) for seed in range(min(self.plans.seeds, SCRIPTED_SEEDS)))
+                first, count = self.plans.first_seed, min(self.plans.seeds, SCRIPTED_SEEDS)
+                yield from ((name, seed) for seed in range(first, first + count))
 
 
 @dataclass(frozen=True)
@@ -81,10 +83,10 @@ class Case:
     @property
     def key(self) -> tuple[Any, ...]:
         """Values that identify the plan."""
-        return tuple(self.row[name] for name in plans.IDENTITY)
+        return tuple(self.row[name] for name in IDENTITY)
 
 
-def planned_study(folder: Path) -> plans.PlanStudy:
+def planned_study(folder: Path) -> PlanStudy:
     """The study of plans with its results in a folder.
 
     Raises:
@@ -92,7 +94,7 @@ def planned_study(folder: Path) -> plans.PlanStudy:
     """
     try:
         config = json.loads((folder / records.CONFIG_FILE).read_text())
-        names = [field.name for field in dataclasses.fields(plans.PlanStudy)]
+        names = [field.name for field in dataclasses.fields(PlanStudy)]
         settings = {name: config[name] for name in names}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
@@ -100,7 +102,7 @@ def planned_study(folder: Path) -> plans.PlanStudy:
             f"study of plans, as results/paper"
         ) from error
     lists = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
-    return plans.PlanStudy(**{**settings, **lists})
+    return PlanStudy(**{**settings, **lists})
 
 
 def run_study(
@@ -113,7 +115,7 @@ def run_study(
             an earlier study is missing or damaged.
     """
     environment = records.environment()
-    rows = records.RowFile(folder / ROWS_FILE, plans.IDENTITY, FIELDS)
+    rows = records.RowFile(folder / ROWS_FILE, IDENTITY, FIELDS)
     rows.resume(environment, mixed=mixed, tell=teller(console))
     if study.source is None:
         found, source = plans.run_study(study.plans, folder, console, mixed=mixed)["runs"], folder
@@ -133,7 +135,7 @@ def run_study(
     }
 
 
-def _earlier_runs(study: plans.PlanStudy, source: Path) -> list[dict[str, Any]]:
+def _earlier_runs(study: PlanStudy, source: Path) -> list[dict[str, Any]]:
     """The runs of an earlier study whose plans are whole.
 
     Raises:
@@ -141,8 +143,8 @@ def _earlier_runs(study: plans.PlanStudy, source: Path) -> list[dict[str, Any]]:
     """
     rows = plans.row_file(source)
     by_key = {rows.key(row): row for row in rows.rows()}
-    found = [by_key[run] for run in plans.all_runs(study) if run in by_key]
-    tasks = {name: study.task(name) for name in study.tasks}
+    found = [by_key[run] for run in study.runs() if run in by_key]
+    tasks = plans.all_tasks(study)
     for row in found:
         if fault := plans.run_fault(tasks, source, row):
             raise records.ResultsError(f"{fault}; run its study again, which makes it again")
@@ -153,12 +155,12 @@ def _replay_fault(
     study: TransferStudy, folder: Path, cases: dict[tuple[Any, ...], Case], row: dict[str, Any]
 ) -> str | None:
     """What is wrong with the replays of a row, whose files are set aside then; or None."""
-    case = cases.get(tuple(row[name] for name in plans.IDENTITY))
+    case = cases.get(tuple(row[name] for name in IDENTITY))
     if case is None:
         return None
     if any(row.get(name) != value for name, value in case.row.items()):
         return f"{folder / ROWS_FILE}: the replay of {row['plan']!r} is of another plan"
-    task = study.plans.task(row["task"])
+    task = study.plans.task(row["task"], row["planner"])
     for variant in VARIANTS:
         path, score = replay_path(folder, row, variant), row[f"mujoco_{variant}_score"]
         if fault := plans.set_plan_aside(path, plans.plan_fault(path, task, (score,))):
@@ -168,8 +170,7 @@ def _replay_fault(
 
 def _row_of_plan(row: dict[str, Any]) -> dict[str, Any]:
     """Fields that a replay's row takes from the row of its plan."""
-    names = ("planning", "task", "seed", "action_space", "pick_encoding", "final_score", "plan")
-    return {name: row[name] for name in names}
+    return {name: row[name] for name in (*IDENTITY, "planning", "final_score", "plan")}
 
 
 def _scripted_cases(study: TransferStudy, folder: Path, console: Console) -> list[Case]:
@@ -186,19 +187,16 @@ def _scripted_cases(study: TransferStudy, folder: Path, console: Console) -> lis
         if fault:
             if name not in executors:
                 console.print(f"{name}: plans made by hand")
-                executors[name] = MassSprings(study.plans.self_contact).executor(task)
+                executors[name] = study.plans.evaluator().executor(task)
             actions = scripted_plan(task, episode)
             execution = executors[name](episode, actions)
-            engine = MassSprings(study.plans.self_contact)
+            engine = study.plans.evaluator()
             records.save_plan(path, task, episode, actions, execution, engine=engine)
         settled = records.load_plan(path).positions[-1].astype(float)
         value = float(score(task, episode, jnp.asarray(settled)))
         row = {
+            **Run(name, study.plans.planners[0], SCRIPTED, SCRIPTED, seed)._asdict(),
             "planning": SCRIPTED,
-            "task": name,
-            "seed": seed,
-            "action_space": SCRIPTED,
-            "pick_encoding": None,
             "final_score": plans.finite(value),
             "plan": f"{plans.PLANS_FOLDER}/{path.name}",
         }
@@ -220,9 +218,11 @@ def _replay_all(
     left = [case for case in cases if case.key in todo]
     with progress_bar(console) as progress:
         bar = progress.add_task("replays in MuJoCo", total=len(left))
-        for name in study.plans.tasks:
-            task = study.plans.task(name)
-            of_task = [case for case in left if case.row["task"] == name]
+        for name, planner in study.plans.pairs():
+            task = study.plans.task(name, planner)
+            of_task = [
+                case for case in left if (case.row["task"], case.row["planner"]) == (name, planner)
+            ]
             for row in _replay_task(task, of_task, folder) if of_task else ():
                 rows.append(row | {"environment": environment})
                 progress.advance(bar)
@@ -269,11 +269,8 @@ class TransferOptions(PlanOptions):
     """Tasks to plan for."""
     action_spaces: tuple[str, ...] = ("key_points",)
     """Action spaces: the particles that a picker may grasp."""
-    pick_encodings: tuple[str, ...] = ("categorical",)
+    pick_encodings: tuple[str, ...] = ("joint",)
     """CEM's encoding of the choice of particles."""
-    planning: Literal["nominal", "robust", "self_contact", "mixed"] = "mixed"
-    """Physics of the search: the body's own physics, an ensemble, self-contact, or self-contact for
-    cloths and the body's own physics for ropes."""
     plans: Path | None = None
     """Folder of an earlier study of plans to replay, which sets the options of planning."""
 

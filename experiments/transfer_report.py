@@ -124,17 +124,19 @@ def _report(study: TransferStudy, summary: dict[str, Any], pictures: list[str]) 
 
 def _table(rows: Rows, success_score: float) -> list[str]:
     """Scores and transfer rates by task and action space."""
-    groups = dict.fromkeys((row["task"], row["action_space"], row["planning"]) for row in rows)
-    header = ["task", "candidates", "planning"]
+    names = ("task", "planner", "action_space", "planning")
+    groups = dict.fromkeys(tuple(row[name] for name in names) for row in rows)
+    header = ["task", "planner", "candidates", "planning"]
     header += [f"{engine}: median (range)" for engine in ENGINES]
     header += [f"{engine}: rate (95 %)" for engine in ENGINES]
     lines = []
-    for task, space, planning in groups:
-        runs = _of(rows, task=task, action_space=space, planning=planning)
+    for group in groups:
+        runs = _of(rows, **dict(zip(names, group, strict=True)))
+        task, planner, space, planning = group
         scores = [np.array([_score(run, column) for run in runs]) for column in ENGINES.values()]
         warned = sum(bool(run["warnings"]) for run in runs)
         cells = [*map(spread, scores), *(_rate(each, success_score) for each in scores), warned]
-        lines.append([task, LABELS[space], planning, *cells])
+        lines.append([task, planner, LABELS[space], planning, *cells])
     return table([*header, "warned"], lines)
 
 

@@ -70,24 +70,32 @@ def plot_simplifications(models: Mapping[str, tuple[Body, Positions, KeyPoints]]
 
 
 def plot_costs(
-    costs: Mapping[str, Mapping[str, Float[np.ndarray, "R I"]]], ylabel: str = "cost of best plan"
+    costs: Mapping[str, Mapping[str, Float[np.ndarray, "R I"]]],
+    ylabel: str = "cost of best plan",
+    *,
+    rollouts: Mapping[str, Mapping[str, Float[np.ndarray, " I"]]] | None = None,
 ) -> "Figure":
     """Cost by iteration, mean with a 95 % confidence interval over runs (Fig. 4 of the paper).
 
     Args:
         costs: costs by task, then method, shape (R, I): one row per run, one column per iteration.
         ylabel: label of the cost axis.
+        rollouts: rollouts up to each iteration, by task, then method, shape (I,), which then are
+            the horizontal axis.
     """
     costs = _arrays("costs", costs, ("R", "I"), "a row of costs by iteration for each run")
     figure, panels = _panels(costs)
     for axes, (name, methods) in zip(panels, costs.items(), strict=True):
         for index, (method, runs) in enumerate(methods.items()):
             iteration = np.arange(1, runs.shape[1] + 1)
+            if rollouts is not None:
+                iteration = rollouts[name][method]
             mean, half = mean_interval(runs)
             color, line = COLORS[index % len(COLORS)], ("-", "--")[index % 2]
             axes.plot(iteration, mean, color=color, ls=line, label=method)
             axes.fill_between(iteration, mean - half, mean + half, color=color, alpha=0.15, lw=0)
-        axes.set(title=_title(name), xlabel="iteration", ylabel=ylabel)
+        label = "iteration" if rollouts is None else "rollouts (counted)"
+        axes.set(title=_title(name), xlabel=label, ylabel=ylabel)
         axes.locator_params(axis="x", integer=True)
         means = np.concatenate([runs.mean(axis=0) for runs in methods.values()])
         axes.set_ylim(0, 1.15 * means[np.isfinite(means)].max(initial=1e-9))

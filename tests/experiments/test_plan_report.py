@@ -38,13 +38,15 @@ def test_success_interval_is_wilsons_formula(count, data):
 def row(seed, score, space="key_points", **fields) -> dict:
     return {
         "task": "t",
+        "planner": "default",
         "action_space": space,
         "pick_encoding": "categorical",
         "seed": seed,
         "final_score": score,
         "success": score is not None and score >= 0.9,
-        "cost_per_iteration": [2.0, 1.0],
-        "rollouts": 8,
+        "cost_per_question": [2.0, 1.0],
+        "rollouts_per_question": [4, 8],
+        "counted_rollouts": 8,
         "non_finite": 0,
         "plan_seconds": 1.0 + seed,
         "compile_seconds": 0.5,
@@ -61,7 +63,7 @@ def test_the_plan_shown_is_the_median_one_of_the_first_method():
 
 def test_run_table_summarises_each_method():
     rows = [row(seed, score) for seed, score in enumerate([0.95, 0.2, 0.91])]
-    rows += [row(0, None, "all_particles", non_finite=8, cost_per_iteration=[None, None])]
+    rows += [row(0, None, "all_particles", non_finite=8, cost_per_question=[None, None])]
     table = plan_report._run_table(rows, [])
     assert len(table) == 4
     first = [cell.strip() for cell in table[2].strip("|").split("|")]
@@ -79,7 +81,7 @@ def test_run_table_summarises_each_method():
 
 
 def test_costs_have_a_row_a_run_and_nothing_finite_is_not_a_number():
-    rows = [row(0, 0.1), row(1, None, cost_per_iteration=[None, 3.0])]
+    rows = [row(0, 0.1), row(1, None, cost_per_question=[None, 3.0])]
     ((name, costs),) = plan_report._costs(rows).items()
     assert name == "key points, categorical"
     np.testing.assert_array_equal(costs, [[2.0, 1.0], [np.nan, 3.0]])

@@ -1,5 +1,6 @@
 """The command: what a study leaves behind, going on after a kill, and wrong requests."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -13,9 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import plan_options, plan_report, plans, run
+from experiments import plan_options, plan_report, run
 from experiments.goals import GoalsOptions
 from experiments.paper import PaperOptions
+from experiments.plan_study import ACTION_SPACES, IDENTITY
+from experiments.planners import PLANNERS, counted_rollouts, with_encoding
+from experiments.simplification import SimplificationOptions
 from jaxsimp import records
 from jaxsimp.planning import CEM, ENCODINGS
 from jaxsimp.records import load_plan
@@ -25,7 +29,8 @@ ROOT = Path(__file__).parents[2]
 TASKS = ("rope_folding", "cloth_diagonal_folding")
 OPTIONS = (
     *("--tasks", *TASKS, "--seeds", "2", "--resolution", "9", "--num-actions", "1"),
-    *("--pick-encodings", "categorical", "--population", "4", "--num-iterations", "2"),
+    *("--planners", "cem_24", "--pick-encodings", "categorical"),
+    *("--population", "4", "--num-iterations", "2"),
 )
 TIMINGS = ("plan_seconds", "compile_seconds", "environment")
 
@@ -69,25 +74,27 @@ def test_summary_has_its_schema(folder):
 def test_runs_have_their_schema(folder):
     runs = finished(folder)["runs"]
     combinations = [
-        (task, space, "categorical", seed)
+        (task, "cem_24", space, "categorical", seed)
         for task in TASKS
-        for space in plans.ACTION_SPACES
+        for space in ACTION_SPACES
         for seed in range(2)
     ]
-    found = [tuple(r[k] for k in ("task", "action_space", "pick_encoding", "seed")) for r in runs]
+    found = [tuple(row[name] for name in IDENTITY) for row in runs]
     assert found == combinations
     for row in runs:
         assert row["num_particles"] == (9 if row["task"] == "rope_folding" else 81)
         assert 2 <= row["num_key_points"] < row["num_particles"]
-        assert len(row["cost_per_iteration"]) == 2
-        assert row["cost_per_iteration"][1] <= row["cost_per_iteration"][0]
+        # The first round has four populations of 4.
+        assert row["rollouts_per_question"] == [4, 8, 12, 16, 20]
+        assert len(row["cost_per_question"]) == 5
+        assert np.all(np.diff(row["cost_per_question"]) <= 0)
         assert row["success"] == (row["final_score"] >= 0.9)
-        assert row["rollouts"] == 20  # 4 times 4 first, then 4
+        assert row["rollouts"] == row["counted_rollouts"] == 20
         assert row["non_finite"] == 0
         assert row["plan_seconds"] > 0
         assert row["compile_seconds"] >= 0
-        assert row["config"]["population"] == 4
-        assert row["config"]["num_iterations"] == 2
+        (cem,) = row["config"]["search"]
+        assert (cem["algorithm"], cem["population"], cem["num_iterations"]) == ("CEM", 4, 2)
         assert row["config"]["num_actions"] == 1
         assert row["environment"]["versions"]["jax"]
 
@@ -154,7 +161,7 @@ def test_figures_show_the_runs_and_the_report_shows_the_figures(results):
         runs = [row for row in summary["runs"] if row["task"] == task]
         drawn = [line.get_ydata() for line in cost.lines]
         # The mean of both seeds, for each of both action spaces.
-        paths = np.array([row["cost_per_iteration"] for row in runs]).reshape(2, 2, -1)
+        paths = np.array([row["cost_per_question"] for row in runs]).reshape(2, 2, -1)
         np.testing.assert_allclose(drawn, paths.mean(axis=1))
         titles = [axes.get_title() for axes in figures[f"plans_{task}.png"].axes]
         shown = plan_report._typical_seed(runs)
@@ -312,6 +319,9 @@ def test_ctrl_c_has_its_exit_status_and_says_how_to_go_on(tmp_path, monkeypatch,
         (("--tasks", "rope_tying"), "unknown task 'rope_tying'; choose from rope_straightening"),
         (("--action-spaces", "corners"), "unknown action space 'corners'; choose from key_points"),
         (("--pick-encodings", "uniform"), "unknown pick encoding 'uniform'; choose from"),
+        (("--planners", "fast"), "unknown planner 'fast'; choose from default"),
+        (("--first-seed", "-1"), "seed is -1; give a whole number from 0"),
+        (("--first-seed", "4294967290"), "seed is 4294967299; give a whole number from 0"),
         (("--seeds", "0"), "seeds is 0; give a whole number"),
         (("--seeds", "-1", "--smoke"), "seeds is -1; give a whole number"),
         (("--num-actions", "0"), "num_actions is 0; give a whole number"),
@@ -381,20 +391,24 @@ def test_the_command_ends_with_its_status(tmp_path):
 def test_list_names_everything(capsys):
     assert command("--list") == 0
     told = capsys.readouterr().out
-    for name in (*TASKS, *plans.ACTION_SPACES, *ENCODINGS):
+    for name in (*TASKS, *PLANNERS, *ACTION_SPACES, *ENCODINGS):
         assert name in told
 
 
 # --- configuration --------------------------------------------------------------------------------
 
 
-def test_options_replace_the_settings_of_the_budget():
+def test_options_replace_the_settings_of_the_planners():
     study = PaperOptions(
-        budget="paper", population=11, smoothing=0.3, keep_best=True, returns="best", num_actions=3
+        planners=("paper",),
+        population=11,
+        smoothing=0.3,
+        keep_best=True,
+        returns="best",
+        num_actions=3,
     ).configuration()
     task = study.task("rope_folding")
-    config = study.search_config(task)
-    assert config == CEM(
+    assert study.search(task, "paper") == CEM(
         num_iterations=20,
         population=11,
         initial_populations=1,
@@ -405,25 +419,53 @@ def test_options_replace_the_settings_of_the_budget():
         returns="best",
     )
     assert task.num_actions == 3
+    # In a sequence they are those of its CEM.
+    study = PaperOptions(population=11).configuration()
+    search = study.search(task, "default").algorithms
+    whole = PaperOptions().configuration().search(task, "default").algorithms
+    assert search == (dataclasses.replace(whole[0], population=11), *whole[1:])
 
 
-def test_the_papers_study_compares_both_of_its_encodings():
-    runs = list(PaperOptions(seeds=1).configuration().runs("rope_folding"))
-    encodings = ("categorical", "gaussian_index")
-    assert runs == [(space, each, 0) for space in plans.ACTION_SPACES for each in encodings]
+@pytest.mark.parametrize("name", ["rope_folding", "cloth_side_folding"])
+def test_what_is_compared_has_the_same_price(name):
+    study = PaperOptions(planners=tuple(PLANNERS)).configuration()
+    prices = {}
+    for planner in ("default", "without_descent", "without_reranking", "cem"):
+        search = study.search(study.task(name, planner), planner)
+        prices[planner] = counted_rollouts(search)[-1]
+        other = with_encoding(search, ENCODINGS["gaussian_index"])
+        assert counted_rollouts(other)[-1] == prices[planner]
+    # Rounds are of 128: none has more than the default, nor less by more than a round.
+    assert all(prices["default"] - 128 < price for price in prices.values())
+    assert max(prices.values()) <= prices["default"] + 16
 
 
-def test_the_paper_budget_is_the_authors():
+def test_seeds_start_where_they_are_told_to():
+    study = PaperOptions(first_seed=1000, seeds=2).configuration()
+    assert {run.seed for run in study.runs()} == {1000, 1001}
+    assert SimplificationOptions(first_seed=7, seeds=1).configuration().first_seed == 7
+
+
+def test_the_papers_study_compares_the_joint_encoding_with_the_papers():
+    runs = PaperOptions(seeds=1, tasks=("rope_folding",)).configuration().runs()
+    encodings = ("joint", "gaussian_index")
+    assert [run[2:] for run in runs] == [
+        (space, each, 0) for space in ACTION_SPACES for each in encodings
+    ]
+
+
+def test_the_paper_planner_is_the_authors():
     # Figures of the author's runs: horizon 15, 0.08 m an axis a step; 70 and 333 plans a round
     # of 20, a tenth of them elites, no smoothing, variance 0.5, the mean returned.
-    study = PaperOptions(budget="paper").configuration()
+    study = PaperOptions(planners=("paper",)).configuration()
     for name, population, elites in [
         ("rope_straightening", 70, 7),
         ("cloth_side_folding", 333, 33),
     ]:
         task = study.task(name)
-        config = study.search_config(task)
+        config = study.search(task, "paper")
         assert (task.num_actions, task.limits) == (15, (0.08, 0.08, 0.08))
+        assert task.running_weight == 1  # the sum of all costs
         assert (config.population, config.num_elites) == (population, elites)
         assert (config.num_iterations, config.smoothing, config.returns) == (20, 0.0, "mean")
         assert config.initial_spread**2 == pytest.approx(0.5)

@@ -15,6 +15,7 @@ from experiments.simplification import CLOTH_LEVELS, ROPE_LEVELS, ROWS_FILE, Sim
 def study(**changes):
     fields = {
         "methods": ("robust",),
+        "first_seed": 0,
         "seeds": 12,
         "rope_sizes": (41,),
         "cloth_sizes": (25, 64),

@@ -20,7 +20,7 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 PLANNING = (
     *("--seeds", "1", "--resolution", "9", "--num-actions", "1"),
-    *("--population", "4", "--num-iterations", "1"),
+    *("--planners", "cem_24", "--population", "4", "--num-iterations", "1"),
 )
 STUDIES = {
     "paper": (

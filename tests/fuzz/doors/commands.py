@@ -192,7 +192,7 @@ WHOLE_NUMBERS = (
 )
 CHOICES = {
     "method": ("robust", "paper", "meshlab"),
-    "budget": ("default", "paper", "goals"),
+    "planners": ("default", "without_descent", "without_reranking", "cem", "cem_24", "paper"),
     "returns": ("best", "mean"),
     "planning": ("nominal", "robust", "self_contact", "mixed"),
     "study": ("paper", "goals", "transfer"),
@@ -209,6 +209,9 @@ def _is_study(**given: Any) -> bool | None:
             is_whole = str(value).isdigit()  # in any script, as Python reads them
             verdicts.append(is_whole and 1 <= int(value) < 2**31)
             verdicts.append(not (name == "resolution" and is_whole and int(value) < 5))
+        elif name == "first_seed":
+            is_seed = str(value).isdigit() and int(value) < 2**32
+            verdicts.append(None if is_seed and int(value) > 2**31 else is_seed)
         elif name in RANGES:
             low, high = RANGES[name]
             number = _is_positive(value, zero=name == "smoothing")
@@ -280,7 +283,8 @@ DOORS = (
             "smoothing": _number_text("0.1", "0.0"),
             "initial_spread": _number_text("0.7"),
             "method": _choice_text("method"),
-            "budget": _choice_text("budget"),
+            "planners": _choice_text("planners"),
+            "first_seed": _number_text("1", "3"),
             "returns": _choice_text("returns"),
             "planning": _choice_text("planning"),
             "out": Parameter(
