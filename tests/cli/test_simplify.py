@@ -417,7 +417,7 @@ def test_a_body_that_is_none_is_refused(name, message, letters, tmp_path, capsys
         (("--figure", "out.txt"), "out.txt is no picture; give --figure a file in .jpg, .pdf"),
         ((*["V.npz"] * 40, "--figure", "out.png"), "41 goals are given; a picture shows 40"),
         (("--json", "a" * 256), "File name too long"),
-        (("--figure", "\0.png"), "null byte); give another --figure"),
+        (("--figure", "\0.png"), "); give another --figure"),
     ],
 )
 def test_wrong_options_are_refused(options, message, letters, tmp_path, capsys, monkeypatch):
