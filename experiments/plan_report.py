@@ -135,8 +135,10 @@ def _report(study: PlanStudy, summary: dict[str, Any], transfer: Rows) -> str:
         f"A plan succeeds when its settled score is at least {study.success_score}. Score 1 is a "
         f"cost of 0, which a goal need not have, and 0 is the start; the body "
         f"{_touching(study)}. "
-        f"{study.seeds} seeds a row; intervals are 95 % "
-        "(Wilson for rates, Student's t in the figures).",
+        f"{study.seeds} seeds a row, from {study.first_seed}; intervals are 95 % "
+        "(Wilson for rates, Student's t in the figures). Ends have the same folds as the goal if "
+        "they unfold alike. A counted rollout is one without self-contact: a gradient counts as "
+        "6, a rollout with self-contact as 4.",
         "",
         *_model_table(summary["models"]),
         "",
@@ -214,6 +216,7 @@ def _run_table(rows: Rows, transfer: Rows) -> list[str]:
                     method,
                     spread(scores),
                     f"{successes}/{len(runs)} ({low:.2f} to {high:.2f})",
+                    _folded(runs),
                     runs[0]["counted_rollouts"],
                     sum(run["non_finite"] for run in runs),
                     f"{np.median([run['plan_seconds'] for run in runs]):.1f}",
@@ -227,6 +230,7 @@ def _run_table(rows: Rows, transfer: Rows) -> list[str]:
             "method",
             "score: median (range)",
             "success rate (95 %)",
+            "same folds",
             "counted rollouts",
             "not finite",
             "seconds to plan",
@@ -235,6 +239,12 @@ def _run_table(rows: Rows, transfer: Rows) -> list[str]:
         ],
         lines,
     )
+
+
+def _folded(runs: Rows) -> str:
+    """How many ends unfold to the folds of the goal."""
+    found = [run["same_folds"] for run in runs]
+    return "–" if None in found else f"{sum(found)}/{len(found)}"
 
 
 def _transferred(runs: Rows, transfer: Rows) -> list[str]:

@@ -17,8 +17,8 @@ from experiments.plan_study import IDENTITY, PlanStudy, Run
 from experiments.planners import Search, counted_rollouts, num_asks, settings, with_encoding
 from experiments.progress import progress_bar
 from experiments.study import teller
-from jaxsimp import records
-from jaxsimp.engines import goal_scores
+from jaxsimp import goals, records
+from jaxsimp.engines import Execution, goal_scores
 from jaxsimp.planning import ENCODINGS, Planner
 from jaxsimp.planning.algorithm import stages
 from jaxsimp.simplification import KeyPoints, simplify
@@ -27,7 +27,14 @@ from jaxsimp.tasks import Task
 ROWS_FILE = "runs.jsonl"
 FIELDS = (
     *("planning", "plan", "final_score", "success", "cost_per_question"),
-    *("rollouts_per_question", "counted_rollouts", "non_finite", "plan_seconds", "compile_seconds"),
+    *(
+        "rollouts_per_question",
+        "counted_rollouts",
+        "non_finite",
+        "same_folds",
+        "plan_seconds",
+        "compile_seconds",
+    ),
 )
 """Fields that reports and replays read."""
 PLANS_FOLDER = "plans"
@@ -211,6 +218,7 @@ def _run(
         "final_cost": finite(float(plan.optimum.cost)),
         "final_score": score,
         "missed_contacts": execution.missed,
+        "same_folds": _same_folds(task, execution),
         "rollouts": plan.num_rollouts,
         "counted_rollouts": plan.price,
         "non_finite": int(plan.optimum.failed),
@@ -219,6 +227,16 @@ def _run(
         "plan": file,
         "config": _row_config(planner, search),
     }
+
+
+def _same_folds(task: Task, execution: Execution) -> bool | None:
+    """Whether the end unfolds to the folds of the goal; None for a goal without folds."""
+    try:
+        wanted = goals.find_folds(task.body, task.goal)
+    except ValueError:
+        return None
+    end = execution.positions[-1].astype(float)
+    return goals.same_folds(task.body, task.goal, end) if wanted else None
 
 
 def _row_config(planner: Planner, search: Search) -> dict[str, Any]:

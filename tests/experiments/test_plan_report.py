@@ -47,6 +47,7 @@ def row(seed, score, space="key_points", **fields) -> dict:
         "cost_per_question": [2.0, 1.0],
         "rollouts_per_question": [4, 8],
         "counted_rollouts": 8,
+        "same_folds": None,
         "non_finite": 0,
         "plan_seconds": 1.0 + seed,
         "compile_seconds": 0.5,
@@ -69,10 +70,10 @@ def test_run_table_summarises_each_method():
     first = [cell.strip() for cell in table[2].strip("|").split("|")]
     assert first[:3] == ["t", "key points, categorical", "0.910 (0.200 to 0.950)"]
     assert first[3].startswith("2/3 (")
-    assert first[4:] == ["8", "0", "2.0", "1.5"]
+    assert first[4:] == ["–", "8", "0", "2.0", "1.5"]
     failed = [cell.strip() for cell in table[3].strip("|").split("|")]
     assert failed[3].startswith("0/1 (")
-    assert failed[5] == "8"
+    assert failed[6] == "8"
     # Two of them have been replayed in MuJoCo.
     replayed = [rows[seed] | {"mujoco_full_score": score} for seed, score in [(0, 0.5), (2, 0.7)]]
     table = plan_report._run_table(rows, replayed)
