@@ -111,8 +111,9 @@ def test_a_callback_is_kept_too(folder, caplog):
 
 def test_a_change_in_another_file_is_noticed(folder):
     assert load().outer(3) == 7
-    (folder / "inner.py").write_text(INNER.format(factor=5))
-    assert load().outer(3) == 16
+    # Of another size: Python's own bytecode knows a file by its size and the second of its change.
+    (folder / "inner.py").write_text(INNER.format(factor=50))
+    assert load().outer(3) == 151
     assert kept(folder) == ["outer.outer"]  # in place of the other
 
 

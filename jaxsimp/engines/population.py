@@ -93,7 +93,7 @@ class PopulationMap:
             layout: layout of the population on the machine.
         """
         population = len(jax.tree.leaves(batch)[0])
-        self._layout, self._population = layout, population
+        self._layout = layout
         self._share = _ceil_to(-(-population // layout.num_workers), layout.chunk_size)
         devices = jax.local_devices()
         self._devices = [devices[w % len(devices)] for w in range(layout.num_workers)]
@@ -132,17 +132,27 @@ class PopulationMap:
         """The function's values on a population, leading axis `B`, on the host.
 
         Raises:
-            ValueError: if the batch has more samples than the example had.
+            ValueError: if the batch has more samples than `capacity`.
         """
         population = len(jax.tree.leaves(batch)[0])
-        if population > self._population:
+        if population > self.capacity:
             raise ValueError(
                 f"the batch has {population} samples; the function was compiled for at most "
-                f"{self._population}"
+                f"{self.capacity}"
             )
         run = partial(self._run, jax.tree.leaves(shared))
-        results = self._pool.map(run, self._devices, self._shares(batch))
+        shares = self._shares(batch)[: -(-population // self._share)]  # the others are empty
+        results = self._pool.map(run, self._devices, shares)
         return jax.tree.map(lambda *parts: np.concatenate(parts)[:population], *results)
+
+    def whole_chunks(self, population: int) -> int:
+        """Number of samples of the chunks that a population takes."""
+        return _ceil_to(population, self._layout.chunk_size)
+
+    @property
+    def capacity(self) -> int:
+        """Largest number of samples of a call: whole chunks on every worker."""
+        return self._share * self._layout.num_workers
 
     def _run(
         self, shared: list[Any], device: jax.Device, share: list[np.ndarray]

@@ -4,7 +4,7 @@ Costs may come from `Planner`, which evaluates plans on all cores, from an engin
 JAX, or from a robot.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -23,8 +23,12 @@ from jaxsimp.planning.loop import (
     Keys,
     Optimum,
     Progress,
+    Question,
+    Ran,
     Recorded,
+    Search,
     absorb,
+    answered,
     ask,
     begin,
     finish,
@@ -75,25 +79,36 @@ def search_on_host(
             not finite count as failures.
     """
 
+    def answers(asked: list[Question]) -> list[Told]:
+        return [_checked(evaluate(*each), *each) for each in asked]
+
+    (found,) = answered([questions(algorithm, space, key, on_ask)], answers)
+    return found
+
+
+def questions(
+    algorithm: Algorithm | Sequence,
+    space: ActionSpace,
+    key: PRNGKeyArray,
+    on_ask: Callable[[], None] = lambda: None,
+) -> Search:
+    """A search on the host, which yields its questions; for the arguments see `search_on_host`."""
+
     def run_stage(
         stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: Keys
-    ) -> tuple[Progress, Actions, Recorded]:
+    ) -> Generator[Question, Any, Ran]:
         exchanges, records = compiled_exchanges(stage, space, len(archive.costs)), []
         progress = exchanges.begin(space, archive, failed)
         for each in keys:
             progress, plans, actions = exchanges.ask(space, progress, each)
-            told = _checked(evaluate(stage.wants, actions), stage.wants, actions)
+            told = yield stage.wants, actions
             progress, recorded = exchanges.absorb(space, progress, plans, told)
             records.append(recorded)
             on_ask()
         recorded = jax.tree.map(lambda *leaves: np.stack(leaves), *records)
         return progress, exchanges.finish(space, progress), recorded
 
-    def cost_of_one(actions: Actions) -> Told:
-        one = jax.tree.map(lambda leaf: leaf[None], actions)
-        return Told(jnp.asarray(_checked(evaluate("cost", one), "cost", one).costs)[0])
-
-    return search(algorithm, space, key, run_stage, cost_of_one)
+    return search(algorithm, space, key, run_stage)
 
 
 def _checked(told: Any, wants: Wants, actions: Actions) -> Told:

@@ -4,7 +4,7 @@
 episodes. `Planner` runs the same `search`, the exchanges of each stage in a loop on the host.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -69,11 +69,15 @@ class Optimum:
 
 Keys = Shaped[Array, "asks *key"]
 """A key for each question."""
-RunStage = Callable[
-    [Algorithm, Archive, Int[Array, ""], Keys], tuple[Progress, Actions, "Recorded"]
-]
-"""Runs one algorithm from an archive and a count of failures, one exchange per key. It returns the
-progress after the last, the algorithm's plan, and a record."""
+Question = tuple[Wants, Actions]
+"""Plans to evaluate, leading axis `B`, and the kind of evaluation."""
+Ran = tuple[Progress, Actions, "Recorded"]
+"""Progress after the last exchange of an algorithm, its plan, and a record."""
+RunStage = Callable[[Algorithm, Archive, Int[Array, ""], Keys], Generator[Question, Any, Ran]]
+"""Runs one algorithm from an archive and a count of failures, one exchange per key. A generator: it
+yields the questions that it does not answer itself."""
+Search = Generator[Question, Any, Optimum]
+"""A search: it yields questions, and is sent their answers."""
 Recorded = tuple[Float[Array | np.ndarray, "*asks"], Mapping[str, Array | np.ndarray]]
 """Lowest cost so far, and the result of `Algorithm.trace`, after one exchange or after each."""
 
@@ -101,31 +105,53 @@ def optimize(
     """
     if batch is not None:
         require_count("batch", batch, 1)
-    space = problem.space
+    space, evaluate = problem.space, partial(_population, problem, batch)
 
     def run_stage(
         stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: Keys
-    ) -> tuple[Progress, Actions, Recorded]:
-        evaluate = partial(_population, problem, stage.wants, batch)
+    ) -> Generator[Question, Any, Ran]:
+        yield from ()  # the questions of a loop are answered inside it
 
         def exchange(progress: Progress, key: PRNGKeyArray) -> tuple[Progress, Recorded]:
             progress, plans, actions = ask(stage, space, progress, key)
-            return absorb(stage, space, progress, plans, evaluate(actions))
+            return absorb(stage, space, progress, plans, evaluate(stage.wants, actions))
 
         first = begin(stage, space, archive, failed)
         progress, recorded = jax.lax.scan(exchange, first, keys)
         return progress, finish(stage, space, progress), recorded
 
-    return search(algorithm, space, key, run_stage, evaluation(problem, "cost"))
+    searching = search(algorithm, space, key, run_stage)
+    (found,) = answered([searching], lambda asked: [evaluate(*each) for each in asked])
+    return found
+
+
+def answered(
+    searches: list[Search], evaluate: Callable[[list[Question]], list[Told]]
+) -> list[Optimum]:
+    """Results of searches side by side, of the same algorithm: a function answers all questions.
+
+    Args:
+        searches: the searches, which ask as many questions of the same kinds.
+        evaluate: function from a question of each search to its answers.
+    """
+    asked = [_step(each, None) for each in searches]
+    while not isinstance(asked[0], Optimum):
+        told = evaluate(asked)
+        asked = [_step(*each) for each in zip(searches, told, strict=True)]
+    return asked
+
+
+def _step(search: Search, told: Told | None) -> Any:
+    """The next question of a search, or its result."""
+    try:
+        return search.send(told)
+    except StopIteration as done:
+        return done.value
 
 
 def search(
-    algorithm: Algorithm | Sequence,
-    space: ActionSpace,
-    key: PRNGKeyArray,
-    run_stage: RunStage,
-    evaluate: Callable[[Actions], Told],
-) -> Optimum:
+    algorithm: Algorithm | Sequence, space: ActionSpace, key: PRNGKeyArray, run_stage: RunStage
+) -> Search:
     """Run the algorithms one after another, for both drivers.
 
     Args:
@@ -133,8 +159,10 @@ def search(
         space: space of plans to search.
         key: key of the random draws.
         run_stage: function that runs the exchanges of one algorithm.
-        evaluate: function that evaluates one plan, for an algorithm whose answer is not the best
-            plan.
+
+    Yields:
+        The questions of `run_stage`; and the plan that is returned, for its cost, if an algorithm's
+        answer is not the best plan.
     """
     _require_key(key)
     archive, failed = empty_archive(space, archive_size(algorithm)), jnp.zeros((), jnp.int32)
@@ -142,12 +170,13 @@ def search(
     for index, stage in enumerate(stages(algorithm)):
         own = jax.random.fold_in(key, index) if index else key
         keys = jax.random.split(own, stage.num_asks)
-        progress, actions, recorded = run_stage(stage, archive, failed, keys)
+        progress, actions, recorded = yield from run_stage(stage, archive, failed, keys)
         archive, failed = progress.archive, progress.failed
         records.append(recorded)
     cost = archive.costs[0]
     if jax.eval_shape(lambda: jax.tree.leaves(stage.answer(space, progress.state))):
-        cost = jnp.asarray(finite(evaluate(actions)).costs)
+        told = yield "cost", jax.tree.map(lambda leaf: leaf[None], actions)
+        cost = jnp.asarray(finite(told).costs)[0]
         failed = failed + jnp.isinf(cost)
     best_costs = jnp.concatenate([costs for costs, _ in records])
     return Optimum(actions, cost, archive, best_costs, tuple(trace for _, trace in records), failed)
@@ -233,7 +262,7 @@ def evaluation(problem: Problem, wants: Wants) -> Callable[[Actions], Told]:
     return lambda actions: Told(*jax.value_and_grad(cost)(actions.displacement, actions.pick))
 
 
-def _population(problem: Problem, wants: Wants, batch: int | None, plans: Actions) -> Told:
+def _population(problem: Problem, batch: int | None, wants: Wants, plans: Actions) -> Told:
     """Evaluate a population as wanted."""
     mapped = partial(_mapped, evaluation(problem, wants), batch=batch)
     if wants != "screened":

@@ -3,8 +3,10 @@
 import dataclasses
 import time
 from collections.abc import Callable
+from collections.abc import Sequence as Seq
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +28,8 @@ from jaxsimp.engines import (
 from jaxsimp.engines.rollouts import as_float, require_plan
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence, Told, Wants, stages
 from jaxsimp.planning.default import default_algorithm
-from jaxsimp.planning.host import compiled_exchanges, search_on_host
-from jaxsimp.planning.loop import Optimum, archive_size, evaluation
+from jaxsimp.planning.host import compiled_exchanges, questions
+from jaxsimp.planning.loop import Optimum, Question, answered, archive_size, evaluation
 from jaxsimp.planning.problem import Candidates, TaskProblem, action_space, make_problem
 from jaxsimp.planning.screening import num_again, screened
 from jaxsimp.planning.space import ActionSpace
@@ -127,24 +129,66 @@ class Planner:
                 body, the seed is none, or the algorithm asks for settled scores and the evaluator
                 is not an engine in JAX.
         """
+        (plan,) = self.plan_batch([episode], [candidates], algorithm, [seed], on_ask)
+        return plan
+
+    def plan_batch(
+        self,
+        episodes: Seq[Episode],
+        candidates: Seq[Candidates],
+        algorithm: Algorithm | Sequence | None = None,
+        seeds: Seq[int] | None = None,
+        on_ask: Callable[[], None] = lambda: None,
+    ) -> tuple[Plan, ...]:
+        """Search for plans of several episodes, as starts or goals, side by side.
+
+        They are the plans that `plan` finds, bit for bit, in less time: what one search leaves idle
+        of the machine another one uses.
+
+        Args:
+            episodes: starts and goals.
+            candidates: particles that a picker may grasp, for each episode.
+            algorithm: algorithm of each search, or a sequence of algorithms; as for `plan`.
+            seeds: seed of each search; 0, 1, ... by default.
+            on_ask: function called after each question of a search.
+
+        Raises:
+            ValueError: if the numbers of episodes, candidates and seeds differ or are 0, or for the
+                reasons of `plan`.
+        """
+        seeds = range(len(episodes)) if seeds is None else seeds
+        if not 0 < len(episodes) == len(candidates) == len(seeds):
+            raise ValueError(
+                f"there are {len(episodes)} episodes, {len(candidates)} sets of candidates and "
+                f"{len(seeds)} seeds; give as many of each, at least one"
+            )
         if algorithm is None:
             reranks = isinstance(self.evaluator, SearchEngine)
             algorithm = default_algorithm(self.task, reranks=reranks)
-        seed = require_seed(seed)
-        episode = require_episode(episode, self.task.body.num_particles)
-        space = action_space(self.task, candidates)
-        compile_seconds = self.prepare(algorithm, space)
-        bill = _Bill(partial(self._told, as_float(episode)), _largest_population(algorithm))
+        keys = [jax.random.key(require_seed(seed)) for seed in seeds]
+        size = self.task.body.num_particles
+        checked = [as_float(require_episode(each, size)) for each in episodes]
+        spaces = [action_space(self.task, each) for each in candidates]
+        compile_seconds = sum(self.prepare(algorithm, space) for space in spaces)
+        bill = _Bill(partial(self._told, checked), _largest_population(algorithm))
         start = time.perf_counter()
-        optimum = search_on_host(algorithm, space, jax.random.key(seed), bill, on_ask)
-        jax.block_until_ready(optimum)
-        return Plan(
-            actions=optimum.actions,
-            optimum=optimum,
-            num_rollouts=bill.num_plans,
-            price=bill.price,
-            seconds=time.perf_counter() - start,
-            compile_seconds=compile_seconds,
+        searches = [
+            questions(algorithm, space, key, on_ask)
+            for space, key in zip(spaces, keys, strict=True)
+        ]
+        found = answered(searches, bill)
+        jax.block_until_ready(found)
+        seconds = time.perf_counter() - start
+        return tuple(
+            Plan(
+                actions=optimum.actions,
+                optimum=optimum,
+                num_rollouts=bill.num_plans,
+                price=bill.price,
+                seconds=seconds / len(found),
+                compile_seconds=compile_seconds / len(found),
+            )
+            for optimum in found
         )
 
     def prepare(self, algorithm: Algorithm | Sequence, space: ActionSpace | None = None) -> float:
@@ -182,7 +226,8 @@ class Planner:
             size for wants, size in self._maps if wants == "cost" and size >= len(actions.pick)
         ]
         size = min(sizes, default=len(actions.pick))
-        return np.asarray(self._told(as_float(episode), "cost", actions, size).costs)
+        (told,) = self._told([as_float(episode)], "cost", [actions], size)
+        return np.asarray(told.costs)
 
     def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
         """Estimate the time of a search, seconds, from one evaluation of random plans.
@@ -194,7 +239,7 @@ class Planner:
             drawn = self._random_plans(stage.num_plans)
             self.prepare(stage)
             start = time.perf_counter()
-            self._told(episode, stage.wants, drawn, stage.num_plans)
+            self._told([episode], stage.wants, [drawn], stage.num_plans)
             seconds += (time.perf_counter() - start) * stage.num_asks
         return seconds
 
@@ -218,20 +263,50 @@ class Planner:
         moves = rng.uniform(-1, 1, (*shape, 3)) * task.limits
         return Actions(jnp.asarray(picks), jnp.asarray(moves, float))
 
-    def _told(self, episode: Episode, wants: Wants, actions: Actions, size: int) -> Told:
-        """Evaluate at most `size` plans on all cores."""
-        if wants == "screened":
-            return screened(
-                lambda all_plans: self._told(episode, "cost", all_plans, size),
-                lambda best: self._look(episode, "screened", best, num_again(size)),
-                actions,
+    def _told(
+        self, episodes: Seq[Episode], wants: Wants, asked: Seq[Actions], size: int
+    ) -> list[Told]:
+        """Evaluate plans of each episode, at most `size` of each, on all cores."""
+        if wants != "screened":
+            return self._look(episodes, wants, asked, size)
+        return [
+            screened(
+                partial(self._look_at, episode, "cost", size),
+                partial(self._look_at, episode, wants, num_again(size)),
+                plans,
             )
-        return self._look(episode, wants, actions, size)
+            for episode, plans in zip(episodes, asked, strict=True)
+        ]
 
-    def _look(self, episode: Episode, wants: Wants, actions: Actions, size: int) -> Told:
-        """Evaluate at most `size` plans in one fidelity."""
+    def _look_at(self, episode: Episode, wants: Wants, size: int, plans: Actions) -> Told:
+        """Evaluate at most `size` plans of one episode in one fidelity."""
+        (told,) = self._look([episode], wants, [plans], size)
+        return told
+
+    def _look(
+        self, episodes: Seq[Episode], wants: Wants, asked: Seq[Actions], size: int
+    ) -> list[Told]:
+        """Evaluate in one fidelity, as many questions at a time as fill all cores.
+
+        A question takes whole chunks, so that its plans run through the same machine code whatever
+        others are beside it.
+        """
         problem, evaluate = self._evaluation(wants, size)
-        return evaluate(dataclasses.replace(problem, episode=episode), actions)
+        width = evaluate.whole_chunks(size)
+        samples = [
+            _samples(episode, actions, width)
+            for episode, actions in zip(episodes, asked, strict=True)
+        ]
+        told: list[Told] = []
+        count = max(1, evaluate.capacity // width)
+        for first in range(0, len(samples), count):
+            group = samples[first : first + count]
+            together = tuple(map(np.concatenate, zip(*group, strict=True)))
+            found = evaluate(problem, together)
+            for index in range(len(group)):
+                own = slice(index * width, index * width + len(asked[len(told)].pick))
+                told.append(jax.tree.map(lambda leaf, own=own: leaf[own], found))
+        return told
 
     def _evaluation(self, wants: Wants, size: int) -> tuple[TaskProblem, PopulationMap]:
         """A problem, and its evaluation compiled for `size` plans.
@@ -250,7 +325,8 @@ class Planner:
         shape = (size, self.task.num_actions, self.task.num_pickers)
         idle = Actions(jnp.full(shape, NONE), jnp.zeros((*shape, 3), float))
         layout = self._layout(problem, wants, size)
-        return PopulationMap(partial(_evaluate, wants), problem, idle, layout)
+        samples = _samples(problem.episode, idle, size)
+        return PopulationMap(partial(_evaluate, wants), problem, samples, layout)
 
     def layout_of(self, algorithm: Algorithm) -> Layout:
         """Layout of an algorithm's questions on this machine."""
@@ -297,19 +373,34 @@ def _evaluations(algorithm: Algorithm) -> list[tuple[Wants, int]]:
     return [("cost", size), (wants, num_again(size))] if wants == "screened" else [(wants, size)]
 
 
-def _evaluate(wants: Wants, problem: TaskProblem, actions: Actions) -> Told:
-    return evaluation(problem, wants)(actions)
+Sample = tuple[Any, ...]
+"""Start, goal, picks and displacements as bare arrays: `Actions` are none of NumPy's."""
+
+
+def _samples(episode: Episode, actions: Actions, width: int) -> Sample:
+    """The plans of an episode with it beside each, padded to `width` with copies of the last."""
+    rows = np.minimum(np.arange(width), len(actions.pick) - 1)
+    beside = [np.broadcast_to(leaf, (width, *leaf.shape)) for leaf in jax.tree.leaves(episode)]
+    return (*beside, *(np.asarray(leaf)[rows] for leaf in jax.tree.leaves(actions)))
+
+
+def _evaluate(wants: Wants, problem: TaskProblem, sample: Sample) -> Told:
+    start, goal, pick, displacement = sample
+    problem = dataclasses.replace(problem, episode=Episode(start, goal))
+    return evaluation(problem, wants)(Actions(pick, displacement))
 
 
 class _Bill:
-    """A function that evaluates plans, and counts them.
+    """A function that answers the questions of searches side by side, and counts for one of them.
 
     Attributes:
-        num_plans: number of plans evaluated so far.
+        num_plans: number of plans evaluated so far for each search.
         price: price of these evaluations, in rollouts.
     """
 
-    def __init__(self, evaluate: Callable[[Wants, Actions, int], Told], population: int) -> None:
+    def __init__(
+        self, evaluate: Callable[[Wants, Seq[Actions], int], list[Told]], population: int
+    ) -> None:
         """Start at a count of zero.
 
         Args:
@@ -319,12 +410,13 @@ class _Bill:
         self._evaluate, self._population = evaluate, population
         self.num_plans = self.price = 0
 
-    def __call__(self, wants: Wants, actions: Actions) -> Told:
+    def __call__(self, asked: list[Question]) -> list[Told]:
         """Evaluate plans."""
-        again = num_again(len(actions.pick)) if wants == "screened" else 0
-        self.num_plans += len(actions.pick) + again
-        self.price += PRICES[wants] * len(actions.pick)
-        is_one_cost = wants == "cost" and len(actions.pick) == 1
+        wants, actions = asked[0]
+        size = len(actions.pick)
+        self.num_plans += size + (num_again(size) if wants == "screened" else 0)
+        self.price += PRICES[wants] * size
+        is_one_cost = wants == "cost" and size == 1
         return self._evaluate(
-            wants, actions, self._population if is_one_cost else len(actions.pick)
+            wants, [plans for _, plans in asked], self._population if is_one_cost else size
         )

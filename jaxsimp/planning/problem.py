@@ -17,8 +17,9 @@ from jaxsimp.simplification import KeyPoints
 from jaxsimp.tasks import Episode, Task
 from jaxsimp.tasks.episode import require_episode
 
-Candidates = KeyPoints | Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]
-"""Particles that a picker may grasp: key points, ids, or a mask of the body's particles."""
+Candidates = KeyPoints | Int[np.ndarray, " _"] | Bool[np.ndarray, " _"]
+"""Particles that a picker may grasp: key points, ids, shape (K,), or a mask of the body's particles,
+shape (N,)."""
 
 
 @runtime_checkable

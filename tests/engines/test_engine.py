@@ -118,8 +118,11 @@ def test_a_plan_is_searched_with_the_engine():
     done = planner.execute(episode, plan.actions)
     # In our dynamics a plan that need not grasp anything could not come near.
     assert done.score > 0.7
-    costs = [np.linalg.norm(done.positions[t] - episode.goal, axis=1).mean() for t in (1, 2, 3)]
-    assert plan.optimum.cost == pytest.approx(sum(costs), rel=1e-5)  # rounding
+    first, second, left = (
+        np.linalg.norm(done.positions[t] - episode.goal, axis=1).mean() for t in (1, 2, 3)
+    )
+    cost = planner.task.running_weight * (first + second) + left
+    assert plan.optimum.cost == pytest.approx(cost, rel=1e-5)  # rounding
 
 
 def test_an_engine_that_refuses_the_task_is_heard():
@@ -178,7 +181,9 @@ def test_an_engine_with_an_executor_alone_evaluates_and_does_not_search():
     assert done.status == ExecutionStatus.FINE
     np.testing.assert_array_equal(done.positions, np.stack([episode.start] * 4))
     settled = Sequence((ALGORITHM, Reranking(2)))
-    with pytest.raises(ValueError, match=r"settled scores and the evaluator is .*Still.* give an"):
+    with pytest.raises(
+        ValueError, match=r"settled scores or screened costs and the evaluator is .*Still.* give an"
+    ):
         planner.plan(episode, np.array([0, 4]), settled, 0)
 
 

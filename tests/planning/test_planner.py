@@ -176,6 +176,30 @@ def test_the_number_of_workers_changes_nothing():
     assert_same(planned(3, "categorical", Layout(1, 1)), planned(3, "categorical", Layout(1, 3)))
 
 
+def test_plans_side_by_side_are_those_alone_bit_for_bit():
+    # Starts and goals differ, as do the numbers of candidates; one question of SEQUENCE fills a
+    # part of a call alone, and several together a whole one.
+    task, made = small_task(), planner(Layout(chunk_size=2, num_workers=2))
+    starts = [task.episode_fn(0).start + np.array([0.0, 0.01 * i, 0.0]) for i in range(3)]
+    episodes = [Episode(each, task.goal) for each in starts]
+    candidates = [CANDIDATES, CANDIDATES[:2], CANDIDATES[1:]]
+    for algorithm in (SEQUENCE, dataclasses.replace(ALGORITHM, wants="screened")):
+        together = made.plan_batch(episodes, candidates, algorithm, [5, 6, 7])
+        for index, plan in enumerate(together):
+            alone = made.plan(episodes[index], candidates[index], algorithm, 5 + index)
+            assert_same(plan, alone)
+    assert np.any(together[0].optimum.best_costs != together[2].optimum.best_costs)
+
+
+def test_as_many_of_each_are_planned_side_by_side():
+    episode = small_task().episode_fn(0)
+    for counts in ((0, 0), (2, 1), (1, 2)):
+        with pytest.raises(ValueError, match=r"there are .* give as many of each, at least one"):
+            planner().plan_batch([episode] * counts[0], [CANDIDATES] * counts[1], ALGORITHM)
+    with pytest.raises(ValueError, match=r"1 sets of candidates and 2 seeds; give as many"):
+        planner().plan_batch([episode], [CANDIDATES], ALGORITHM, [0, 1])
+
+
 # --- costs and scores ----------------------------------------------------------------------------
 
 
