@@ -18,7 +18,7 @@ from jaxsimp.tasks import Episode, Task
 from jaxsimp.tasks.episode import require_episode
 
 Candidates = KeyPoints | Int[np.ndarray, " _"] | Bool[np.ndarray, " _"]
-"""Particles that a picker may grasp: key points, ids, shape (K,), or a mask of particles, shape (N,)."""
+"""Particles that a picker may grasp: key points, ids, shape (K,), or a mask, shape (N,)."""
 
 
 @runtime_checkable
