@@ -1,4 +1,4 @@
-"""The page "When something goes wrong": each message that it quotes is one of the sources."""
+"""The page "When something goes wrong": it quotes messages of the sources, and has all of them."""
 
 import ast
 import re
@@ -8,8 +8,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "troubleshooting.md"
-SOURCES = [*(ROOT / "jaxsimp").rglob("*.py"), *(ROOT / "experiments").glob("*.py")]
+SOURCES = [*(ROOT / "jaxsimp").rglob("*.py"), *(ROOT / "experiments").rglob("*.py")]
 VALUE = "…"
+WORDS = 3
+"""Least number of fixed words of a message that the page must have: others pass on a message."""
 
 
 def quoted() -> list[str]:
@@ -30,6 +32,14 @@ def text_of(node: ast.expr) -> str:
     return VALUE
 
 
+def raised() -> list[str]:
+    """Texts of the errors that the sources raise, with `VALUE` for each part that is computed."""
+    nodes = [node for path in SOURCES for node in ast.walk(ast.parse(path.read_text()))]
+    calls = [node.exc for node in nodes if isinstance(node, ast.Raise)]
+    texts = [text_of(text) for call in calls if isinstance(call, ast.Call) for text in call.args]
+    return sorted({text for text in texts if len(re.findall(r"\w+", text)) >= WORDS})
+
+
 @pytest.fixture(scope="module")
 def written() -> str:
     """Every text in the sources, one a line."""
@@ -47,3 +57,11 @@ def test_a_quoted_message_is_in_the_sources(message, written):
     # Fixed words in their order, with anything between: values, and words of a branch.
     parts = [re.escape(part.strip()) for part in message.split(VALUE)]
     assert re.search(".*".join(parts), written), message
+
+
+def test_every_error_of_the_sources_is_on_the_page():
+    # A quoted message is a form: its fixed words in their order, with anything between.
+    forms = [re.compile(".*".join(map(re.escape, each.split(VALUE)))) for each in quoted()]
+    texts = raised()
+    assert len(texts) > 200
+    assert not [text for text in texts if not any(form.search(text) for form in forms)]
