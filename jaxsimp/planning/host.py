@@ -28,6 +28,7 @@ from jaxsimp.planning.loop import (
     ask,
     begin,
     finish,
+    first_archive,
     search,
 )
 from jaxsimp.planning.space import ActionSpace, Plans
@@ -60,6 +61,7 @@ def search_on_host(
     key: PRNGKeyArray,
     evaluate: Evaluate,
     on_ask: Callable[[], None] = lambda: None,
+    initial: Plans | None = None,
 ) -> Optimum:
     """Search for a plan of low cost: `optimize`, in a loop on the host.
 
@@ -69,10 +71,11 @@ def search_on_host(
         key: key of the random draws.
         evaluate: function that evaluates plans; costs may be NumPy arrays.
         on_ask: function called after each question of an algorithm.
+        initial: plans to start from, see `optimize`.
 
     Raises:
         ValueError: if `evaluate` returns no `Told`, or no number for each plan; numbers that are
-            not finite count as failures.
+            not finite count as failures. If the shapes of `initial` are not those of plans.
     """
 
     def run_stage(
@@ -89,11 +92,15 @@ def search_on_host(
         recorded = jax.tree.map(lambda *leaves: np.stack(leaves), *records)
         return progress, exchanges.finish(space, progress), recorded
 
+    def costs(actions: Actions) -> Told:
+        return _checked(evaluate("cost", actions), "cost", actions)
+
     def cost_of_one(actions: Actions) -> Told:
         one = jax.tree.map(lambda leaf: leaf[None], actions)
-        return Told(jnp.asarray(_checked(evaluate("cost", one), "cost", one).costs)[0])
+        return Told(jnp.asarray(costs(one).costs)[0])
 
-    return search(algorithm, space, key, run_stage, cost_of_one)
+    start = first_archive(algorithm, space, initial, costs)
+    return search(algorithm, space, key, run_stage, cost_of_one, *start)
 
 
 def _checked(told: Any, wants: Wants, actions: Actions) -> Told:

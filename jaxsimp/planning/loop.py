@@ -84,6 +84,7 @@ def optimize(
     key: PRNGKeyArray,
     *,
     batch: int | None = None,
+    initial: Plans | None = None,
 ) -> Optimum:
     """Search for a plan of low cost; pure, so that `jit` and `vmap` apply.
 
@@ -95,13 +96,18 @@ def optimize(
         key: key of the random draws.
         batch: number of plans evaluated at a time under one `vmap`; by default all plans of a
             question.
+        initial: plans to start from, leading axis `B`, as `space.plans` makes them of actions.
+            They are evaluated; the first algorithm that starts from the archive begins with the
+            best of them.
 
     Raises:
-        ValueError: if the key is no key, or `batch` is no number of plans.
+        ValueError: if the key is no key, `batch` is no number of plans, or the shapes of `initial`
+            are not those of plans.
     """
     if batch is not None:
         require_count("batch", batch, 1)
     space = problem.space
+    start = first_archive(algorithm, space, initial, partial(_population, problem, "cost", batch))
 
     def run_stage(
         stage: Algorithm, archive: Archive, failed: Int[Array, ""], keys: Keys
@@ -116,7 +122,39 @@ def optimize(
         progress, recorded = jax.lax.scan(exchange, first, keys)
         return progress, finish(stage, space, progress), recorded
 
-    return search(algorithm, space, key, run_stage, evaluation(problem, "cost"))
+    return search(algorithm, space, key, run_stage, evaluation(problem, "cost"), *start)
+
+
+def first_archive(
+    algorithm: Algorithm | Sequence,
+    space: ActionSpace,
+    initial: Plans | None,
+    evaluate: Callable[[Actions], Told],
+) -> tuple[Archive, Int[Array, ""]]:
+    """The archive before a search, and the number of its plans whose cost was not finite.
+
+    Args:
+        algorithm: algorithm of the search, or a sequence of algorithms.
+        space: space of plans to search.
+        initial: plans to start from, leading axis `B`; None for none.
+        evaluate: function that gives the costs of plans, leading axis `B`.
+
+    Raises:
+        ValueError: if the shapes of `initial` are not those of plans.
+    """
+    archive, failed = empty_archive(space, archive_size(algorithm)), jnp.zeros((), jnp.int32)
+    if initial is None:
+        return archive, failed
+    shape = (space.num_actions, space.num_pickers)
+    choice, direction = np.shape(initial.choice), np.shape(initial.direction)
+    if len(choice) != 3 or choice[1:] != shape or not choice[0] or direction != (*choice, 3):
+        raise ValueError(
+            f"initial has choice of shape {choice} and direction of shape {direction}; give shapes "
+            f"(B, {shape[0]}, {shape[1]}) and (B, {shape[0]}, {shape[1]}, 3)"
+        )
+    costs = jnp.asarray(finite(evaluate(space.actions(initial))).costs)
+    failed = failed + jnp.sum(jnp.isinf(costs), dtype=jnp.int32)
+    return archived(archive, space, initial, costs), failed
 
 
 def search(
@@ -125,6 +163,8 @@ def search(
     key: PRNGKeyArray,
     run_stage: RunStage,
     evaluate: Callable[[Actions], Told],
+    archive: Archive,
+    failed: Int[Array, ""],
 ) -> Optimum:
     """Run the algorithms one after another, for both drivers.
 
@@ -135,9 +175,10 @@ def search(
         run_stage: function that runs the exchanges of one algorithm.
         evaluate: function that evaluates one plan, for an algorithm whose answer is not the best
             plan.
+        archive: archive to start from, see `first_archive`.
+        failed: number of its plans whose cost was not finite.
     """
     _require_key(key)
-    archive, failed = empty_archive(space, archive_size(algorithm)), jnp.zeros((), jnp.int32)
     records = []
     for index, stage in enumerate(stages(algorithm)):
         own = jax.random.fold_in(key, index) if index else key

@@ -111,6 +111,7 @@ class Planner:
         algorithm: Algorithm | Sequence | None = None,
         seed: int = 0,
         on_ask: Callable[[], None] = lambda: None,
+        initial: Actions | None = None,
     ) -> Plan:
         """Search for a plan.
 
@@ -121,11 +122,14 @@ class Planner:
                 `default_algorithm`, without its reranking if the evaluator is not in JAX.
             seed: seed of the random draws.
             on_ask: function called after each question of the algorithm.
+            initial: plans to start from, shapes (B, T, G) and (B, T, G, 3), as those of an earlier
+                search; they are evaluated, and count.
 
         Raises:
             ValueError: if a candidate is not a particle of the body, the episode is not of the
-                body, the seed is none, or the algorithm asks for settled scores and the evaluator
-                is not an engine in JAX.
+                body, the seed is none, the algorithm asks for settled scores and the evaluator
+                is not an engine in JAX, or a plan to start from is not of the task, picks a
+                particle that is no candidate, or goes beyond the limits.
         """
         if algorithm is None:
             reranks = isinstance(self.evaluator, SearchEngine)
@@ -133,10 +137,15 @@ class Planner:
         seed = require_seed(seed)
         episode = require_episode(episode, self.task.body.num_particles)
         space = action_space(self.task, candidates)
-        compile_seconds = self.prepare(algorithm, space)
-        bill = _Bill(partial(self._told, as_float(episode)), _largest_population(algorithm))
+        plans = None
+        if initial is not None:
+            plans = space.plans(require_plan(self.task, initial, batch=True))
+        num_initial = 0 if plans is None else len(plans.choice)
+        compile_seconds = self.prepare(algorithm, space, num_initial)
+        population = _largest_population(algorithm) or max(1, num_initial)
+        bill = _Bill(partial(self._told, as_float(episode)), population)
         start = time.perf_counter()
-        optimum = search_on_host(algorithm, space, jax.random.key(seed), bill, on_ask)
+        optimum = search_on_host(algorithm, space, jax.random.key(seed), bill, on_ask, plans)
         jax.block_until_ready(optimum)
         return Plan(
             actions=optimum.actions,
@@ -147,18 +156,27 @@ class Planner:
             compile_seconds=compile_seconds,
         )
 
-    def prepare(self, algorithm: Algorithm | Sequence, space: ActionSpace | None = None) -> float:
+    def prepare(
+        self,
+        algorithm: Algorithm | Sequence,
+        space: ActionSpace | None = None,
+        num_initial: int = 0,
+    ) -> float:
         """Compile the functions of an algorithm, and return the compilation time, seconds.
 
         Args:
             algorithm: algorithm of the search, or a sequence of algorithms.
             space: space of plans to search; without it `prepare` compiles only the evaluations.
+            num_initial: number of plans to start from.
 
         Raises:
             ValueError: if the algorithm asks for settled scores and the evaluator is not an engine
                 in JAX.
         """
         start = time.perf_counter()
+        if num_initial:  # the cost of a single plan is compiled for a whole population
+            single = _largest_population(algorithm) or 1
+            self._evaluation("cost", num_initial if num_initial > 1 else single)
         for stage in stages(algorithm):
             for wants, size in _evaluations(stage):
                 self._evaluation(wants, size)
@@ -286,9 +304,9 @@ def _is_object(given: object) -> bool:
 
 
 def _largest_population(algorithm: Algorithm | Sequence) -> int:
-    """Largest number of plans in a question for costs; 1 if the algorithm asks for none."""
+    """Largest number of plans in a question for costs; 0 if the algorithm asks for none."""
     asked = [each for stage in stages(algorithm) for each in _evaluations(stage)]
-    return max((size for wants, size in asked if wants == "cost"), default=1)
+    return max((size for wants, size in asked if wants == "cost"), default=0)
 
 
 def _evaluations(algorithm: Algorithm) -> list[tuple[Wants, int]]:
