@@ -6,7 +6,6 @@ the resolution. So the many rollouts of a search run on a coarse body of the sam
 few of a local search, with self-contact, on the fine one.
 """
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -28,96 +27,99 @@ from jaxsimp.tasks import Episode, Task
 from jaxsimp.tasks.episode import require_episode
 
 SHARED = ("num_actions", "num_pickers", "limits", "action_seconds")
-"""Settings of the two tasks that must be equal, for one plan to serve both."""
+"""Settings that the tasks must share, for one plan to serve all."""
+REFINEMENT = LocalSearch((0.1, 0.08, 0.06, 0.05, 0.04, 0.03))
+"""Refinement between the coarsest body and the finest."""
+LAST_REFINEMENT = LocalSearch((0.03,))
+"""Refinement on the finest body, after others."""
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPlan(Plan):
-    """A plan that was searched for on a coarse body and refined on the fine one.
+    """A plan that was searched for on a coarse body and refined on finer ones.
 
-    `actions` and `optimum` are of the fine body; `num_rollouts`, `price`, `seconds` and
-    `compile_seconds` are sums over both bodies. A rollout counts the same on both, though one of a
-    cloth of 90 x 90 takes some 40 times as long as one of 25 x 25: compare prices only between
-    plans of the same two resolutions, and seconds otherwise.
+    `actions` and `optimum` are of the finest body; `num_rollouts`, `price`, `seconds` and
+    `compile_seconds` are sums over all bodies. A rollout counts the same on each, though one of a
+    cloth of 100 x 100 takes over a hundred times as long as one of 25 x 25: compare prices between
+    plans of the same resolutions only, and seconds otherwise.
 
     Attributes:
-        coarse: the plan of the coarse body, and the record of its search.
-        refined: the part of the fine body: its rollouts, price and seconds alone.
+        parts: the plan of each body, the coarsest first, and the record of its search.
     """
 
-    coarse: Plan
-    refined: Plan
+    parts: tuple[Plan, ...]
 
 
 class CoarseToFinePlanner:
     """Planner of a task with a fine body, with the functions of `Planner`.
 
-    It searches on a coarse body, from the same start, over the particles nearest to the candidates.
-    The plans found pick the candidates themselves again, and are refined on the fine body.
+    It searches on the coarsest body, from the same start, over the particles nearest to the
+    candidates. The plan found is refined on each finer body in turn, where it picks the particles
+    nearest to the same candidates: on the finest, the candidates.
 
     Attributes:
-        fine: planner of the task.
-        coarse: planner of the task with the coarse body.
-        refinement: algorithm that starts from the plans found, on the fine body.
+        planners: planners of the bodies, the coarsest first.
+        refinements: algorithms that start from the plan found before, one for each finer body.
     """
 
     def __init__(
         self,
         task: Task,
-        coarse_task: Task,
+        coarser: Task | tuple[Task, ...],
         engine: SearchEngine | None = None,
         evaluator: Engine | None = None,
         layout: Layout | None = None,
-        refinement: Algorithm | Sequence | None = None,
+        refinements: tuple[Algorithm | Sequence, ...] | None = None,
     ) -> None:
         """Make a planner; compilation waits until it is needed.
 
         Args:
             task: the task.
-            coarse_task: the same task with a coarse body of the same extent, as
-                `make_task(task.name, 25)`.
+            coarser: the same task with a coarser body of the same extent, or with several, the
+                coarsest first; as `make_task(task.name, 25)`.
             engine: engine that gives the costs of plans, see `Planner`.
-            evaluator: engine that carries out the plan found, see `Planner`; the refinement by
-                default needs one in JAX.
+            evaluator: engine that carries out the plan found, see `Planner`; the refinements by
+                default need one in JAX.
             layout: layout of populations on this machine; by default the fastest in measurements.
-            refinement: algorithm on the fine body; by default `LocalSearch`.
+            refinements: an algorithm for each body but the coarsest; by default local searches, of
+                six rounds between the coarsest and the finest body and one on the finest; of three
+                if there are but two bodies.
 
         Raises:
-            ValueError: if the two tasks do not share what a plan depends on, or `Planner` raises.
+            ValueError: if there is no coarser task, a coarser task does not share what a plan
+                depends on, the number of refinements is not that of finer bodies, or `Planner`
+                raises.
         """
-        for name in SHARED:
-            fine, coarse = getattr(task, name), getattr(coarse_task, name)
-            if fine != coarse:
-                raise ValueError(
-                    f"{name} is {fine} in the task and {coarse} in the coarse one; give the same "
-                    f"task at two resolutions"
-                )
-        self.refinement = LocalSearch() if refinement is None else refinement
-        stages(self.refinement)  # raises for what is no algorithm
-        self.fine = Planner(task, engine, evaluator, layout)
-        self.coarse = Planner(coarse_task, engine, evaluator, layout)
+        coarse_tasks = (coarser,) if isinstance(coarser, Task) else tuple(coarser)
+        _require_one_task(task, coarse_tasks)
+        self.refinements = _refinements(refinements, len(coarse_tasks))
+        self.planners = tuple(
+            Planner(each, engine, evaluator, layout) for each in (*coarse_tasks, task)
+        )
         # Raises for bodies of other extents.
-        self._to_coarse = nearest_particles(task.body, coarse_task.body)
+        self._nearest = [
+            nearest_particles(task.body, planner.task.body) for planner in self.planners
+        ]
 
     @property
     def task(self) -> Task:
         """The task, with the fine body."""
-        return self.fine.task
+        return self.planners[-1].task
 
     @property
     def engine(self) -> SearchEngine:
         """Engine that gives the costs of plans."""
-        return self.fine.engine
+        return self.planners[-1].engine
 
     @property
     def evaluator(self) -> Engine:
         """Engine that carries out the plan found, and scores it."""
-        return self.fine.evaluator
+        return self.planners[-1].evaluator
 
     @property
     def layout(self) -> Layout | None:
         """Layout of populations on this machine; None for the fastest in measurements."""
-        return self.fine.layout
+        return self.planners[-1].layout
 
     def plan(
         self,
@@ -127,78 +129,86 @@ class CoarseToFinePlanner:
         seed: int = 0,
         on_ask: Callable[[], None] = lambda: None,
     ) -> RefinedPlan:
-        """Search for a plan on the coarse body, and refine it on the fine one.
+        """Search for a plan on the coarsest body, and refine it on the finer ones.
 
         Args:
             episode: start and goal of the fine body.
             candidates: particles of the fine body that a picker may grasp. Of several with one
                 nearest coarse particle, the nearest to it is kept.
-            algorithm: algorithm of the coarse search; by default that of `Planner`.
+            algorithm: algorithm of the coarsest search; by default that of `Planner`.
             seed: seed of the random draws.
-            on_ask: function called after each question, of the search and of the refinement.
+            on_ask: function called after each question of the search and of the refinements.
 
         Raises:
             ValueError: as `Planner.plan`.
         """
         episode = require_episode(episode, self.task.body.num_particles)
-        ids, coarse_ids = self._paired(candidates)
-        start = self.coarse_episode(episode)
-        coarse = self.coarse.plan(start, coarse_ids, algorithm, seed, on_ask)
-        new_ids = np.zeros(self.coarse.task.body.num_particles, int)
-        new_ids[coarse_ids] = ids
-        count = max(1, *(stage.num_starts for stage in stages(self.refinement)))
-        found = best_distinct(action_space(self.coarse.task, coarse_ids), coarse, count)
-        refined = self.fine.plan(
-            episode, ids, self.refinement, seed, on_ask, renamed(found, new_ids)
-        )
+        ids = self._ids(candidates)
+        first, *finer = self.planners
+        parts = [first.plan(self._episode(first, episode), ids[0], algorithm, seed, on_ask)]
+        for level, (planner, refinement) in enumerate(zip(finer, self.refinements, strict=True)):
+            before, found = self.planners[level].task, parts[-1]
+            starts = best_distinct(action_space(before, ids[level]), found, _num_starts(refinement))
+            new_ids = np.zeros(before.body.num_particles, int)
+            new_ids[ids[level]] = ids[level + 1]
+            start = self._episode(planner, episode)
+            initial = renamed(starts, new_ids)
+            parts.append(planner.plan(start, ids[level + 1], refinement, seed, on_ask, initial))
         sums = ("num_rollouts", "price", "seconds", "compile_seconds")
         return RefinedPlan(
-            actions=refined.actions,
-            optimum=refined.optimum,
-            **{name: getattr(coarse, name) + getattr(refined, name) for name in sums},
-            coarse=coarse,
-            refined=refined,
+            actions=parts[-1].actions,
+            optimum=parts[-1].optimum,
+            **{name: sum(getattr(part, name) for part in parts) for name in sums},
+            parts=tuple(parts),
         )
 
-    def coarse_episode(self, episode: Episode) -> Episode:
-        """The episode of the coarse body that lies where the fine one lies."""
-        bodies = self.task.body, self.coarse.task.body
+    def _episode(self, planner: Planner, episode: Episode) -> Episode:
+        """The episode of a planner's body that lies where the fine one lies."""
+        fine, body = self.task.body, planner.task.body
+        if planner is self.planners[-1]:
+            return episode
         start, goal = (
-            carried_positions(bodies[0], np.asarray(positions), bodies[1])
+            carried_positions(fine, np.asarray(positions), body)
             for positions in (episode.start, episode.goal)
         )
         return Episode(start, goal)
 
     def prepare(self, algorithm: Algorithm | Sequence, space: ActionSpace | None = None) -> float:
-        """Compile the functions of both searches, and return the compilation time, seconds.
+        """Compile the functions of all searches, and return the compilation time, seconds.
 
         Args:
-            algorithm: algorithm of the coarse search.
+            algorithm: algorithm of the coarsest search.
             space: space of plans of the fine body; without it only the evaluations are compiled.
 
         Raises:
             ValueError: as `Planner.prepare`.
         """
-        coarse_space = None
+        spaces: list[ActionSpace | None] = [None] * len(self.planners)
         if space is not None:
-            ids, coarse_ids = self._paired(np.asarray(space.candidates))
-            space, coarse_space = (
-                dataclasses.replace(space, candidates=jnp.asarray(each))
-                for each in (ids, coarse_ids)
-            )
-        count = max(1, *(stage.num_starts for stage in stages(self.refinement)))
-        return self.coarse.prepare(algorithm, coarse_space) + self.fine.prepare(
-            self.refinement, space, count
-        )
+            spaces = [
+                action_space(planner.task, ids)
+                for planner, ids in zip(
+                    self.planners, self._ids(np.asarray(space.candidates)), strict=True
+                )
+            ]
+        seconds = self.planners[0].prepare(algorithm, spaces[0])
+        for planner, refinement, own in zip(
+            self.planners[1:], self.refinements, spaces[1:], strict=True
+        ):
+            seconds += planner.prepare(refinement, own, _num_starts(refinement))
+        return seconds
 
     def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
-        """Estimate the time of a search and of its refinement, see `Planner.estimate_seconds`."""
-        refinement = self.fine.estimate_seconds(self.refinement)
-        return self.coarse.estimate_seconds(algorithm) + refinement
+        """Estimate the time of all searches, see `Planner.estimate_seconds`."""
+        searches = (algorithm, *self.refinements)
+        return sum(
+            planner.estimate_seconds(search)
+            for planner, search in zip(self.planners, searches, strict=True)
+        )
 
     def layout_of(self, algorithm: Algorithm) -> Layout:
-        """Layout of the questions of the coarse search on this machine."""
-        return self.coarse.layout_of(algorithm)
+        """Layout of the questions of the coarsest search on this machine."""
+        return self.planners[0].layout_of(algorithm)
 
     def execute(self, episode: Episode, actions: Actions) -> Execution:
         """Carry out a plan on the fine body in the evaluator's physics, settle it, and score it.
@@ -206,20 +216,51 @@ class CoarseToFinePlanner:
         Raises:
             ValueError: if the episode or the plan is not of the task.
         """
-        return self.fine.execute(episode, actions)
+        return self.planners[-1].execute(episode, actions)
 
-    def _paired(
-        self, candidates: Candidates
-    ) -> tuple[Int[np.ndarray, " K"], Int[np.ndarray, " K"]]:
-        """Fine candidates, and the nearest coarse particle of each; neither has one twice."""
+    def _ids(self, candidates: Candidates) -> list[Int[np.ndarray, " K"]]:
+        """Ids of the candidates in each body, the coarsest first; no particle is there twice."""
         given = candidates.particles if isinstance(candidates, KeyPoints) else candidates
         fine = self.task.body
         ids = as_candidates(given, fine.num_particles)
-        coarse_ids = self._to_coarse[ids]
-        apart = np.linalg.norm(fine.rest[ids] - self.coarse.task.body.rest[coarse_ids], axis=1)
-        order = np.lexsort((apart, coarse_ids))  # the nearest first, of one coarse particle
-        _, first = np.unique(coarse_ids[order], return_index=True)
-        return ids[order][first], coarse_ids[order][first]
+        for planner, nearest in zip(self.planners, self._nearest, strict=True):
+            own = nearest[ids]
+            apart = np.linalg.norm(fine.rest[ids] - planner.task.body.rest[own], axis=1)
+            order = np.lexsort((apart, own))  # of one coarse particle, the nearest first
+            _, first = np.unique(own[order], return_index=True)
+            ids = np.sort(ids[order][first])
+        return [nearest[ids] for nearest in self._nearest]
+
+
+def _require_one_task(task: Task, coarser: tuple[Task, ...]) -> None:
+    if not coarser:
+        raise ValueError("coarser has no task; give the task with a coarser body, at least once")
+    for name in SHARED:
+        values = [getattr(each, name) for each in (*coarser, task)]
+        if any(value != values[-1] for value in values):
+            raise ValueError(
+                f"{name} is {values[-1]} in the task and {values[:-1]} in the coarser ones; give "
+                f"the same task at several resolutions"
+            )
+
+
+def _refinements(
+    given: tuple[Algorithm | Sequence, ...] | None, count: int
+) -> tuple[Algorithm | Sequence, ...]:
+    """A refinement for each body but the coarsest."""
+    if given is None:
+        return (*[REFINEMENT] * (count - 1), LAST_REFINEMENT if count > 1 else LocalSearch())
+    if not isinstance(given, (tuple, list)) or len(given) != count:
+        raise ValueError(
+            f"refinements is {given!r}; give a tuple of {count}, one for each body but the coarsest"
+        )
+    for each in given:
+        stages(each)  # raises for what is no algorithm
+    return tuple(given)
+
+
+def _num_starts(refinement: Algorithm | Sequence) -> int:
+    return max(1, *(stage.num_starts for stage in stages(refinement)))
 
 
 def best_distinct(space: ActionSpace, plan: Plan, count: int) -> Actions:
