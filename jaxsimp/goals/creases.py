@@ -143,7 +143,10 @@ def _fitted(panels: Panels, moves: Moves, first: Creases) -> tuple[Creases, floa
         return np.concatenate([off.real, off.imag])
 
     count = 3 + 2 * len(first.lines)
-    found = least_squares(misfit, np.zeros(count), loss="soft_l1", f_scale=OUTLIER)
+    # By matrix-free steps: a decomposition of so tall a matrix waits for threads on a busy machine.
+    found = least_squares(
+        misfit, np.zeros(count), loss="soft_l1", f_scale=OUTLIER, tr_solver="lsmr"
+    )
     return first.changed(found.x, scale), 2 * float(found.cost)
 
 

@@ -6,11 +6,14 @@ A *problem* gives the cost of plans; an *algorithm*, one file each, asks for cos
 
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Defaults, Sequence, Told, Wants, price
 from jaxsimp.planning.archive import Archive
+from jaxsimp.planning.between_bodies import carry_over
 from jaxsimp.planning.cem import CEM
+from jaxsimp.planning.coarse_to_fine import CoarseToFinePlanner, RefinedPlan
 from jaxsimp.planning.default import default_algorithm
 from jaxsimp.planning.descent import Descent
 from jaxsimp.planning.encodings import ENCODINGS, Categorical, Encoding, GaussianIndex, Joint
 from jaxsimp.planning.host import search_on_host
+from jaxsimp.planning.local_search import LocalSearch
 from jaxsimp.planning.loop import Optimum, optimize
 from jaxsimp.planning.planner import Plan, Planner
 from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_space, make_problem
@@ -27,23 +30,27 @@ __all__ = [
     "Archive",
     "Candidates",
     "Categorical",
+    "CoarseToFinePlanner",
     "Defaults",
     "Descent",
     "Encoding",
     "GaussianIndex",
     "Joint",
+    "LocalSearch",
     "Optimum",
     "Plan",
     "Planner",
     "Plans",
     "Problem",
     "RandomShooting",
+    "RefinedPlan",
     "Reranking",
     "Sequence",
     "TaskProblem",
     "Told",
     "Wants",
     "action_space",
+    "carry_over",
     "default_algorithm",
     "make_problem",
     "optimize",

@@ -64,6 +64,7 @@ def search_on_host(
     key: PRNGKeyArray,
     evaluate: Evaluate,
     on_ask: Callable[[], None] = lambda: None,
+    initial: Plans | None = None,
 ) -> Optimum:
     """Search for a plan of low cost: `optimize`, in a loop on the host.
 
@@ -73,16 +74,17 @@ def search_on_host(
         key: key of the random draws.
         evaluate: function that evaluates plans; costs may be NumPy arrays.
         on_ask: function called after each question of an algorithm.
+        initial: plans to start from, leading axis `B`, as `space.plans` makes them of actions.
 
     Raises:
         ValueError: if `evaluate` returns no `Told`, or no number for each plan; numbers that are
-            not finite count as failures.
+            not finite count as failures. If the shapes of `initial` are not those of plans.
     """
 
     def answers(asked: list[Question]) -> list[Told]:
         return [_checked(evaluate(*each), *each) for each in asked]
 
-    (found,) = answered([questions(algorithm, space, key, on_ask)], answers)
+    (found,) = answered([questions(algorithm, space, key, on_ask, initial)], answers)
     return found
 
 
@@ -91,6 +93,7 @@ def questions(
     space: ActionSpace,
     key: PRNGKeyArray,
     on_ask: Callable[[], None] = lambda: None,
+    initial: Plans | None = None,
 ) -> Search:
     """A search on the host, which yields its questions; for the arguments see `search_on_host`."""
 
@@ -108,7 +111,7 @@ def questions(
         recorded = jax.tree.map(lambda *leaves: np.stack(leaves), *records)
         return progress, exchanges.finish(space, progress), recorded
 
-    return search(algorithm, space, key, run_stage)
+    return search(algorithm, space, key, run_stage, initial)
 
 
 def _checked(told: Any, wants: Wants, actions: Actions) -> Told:

@@ -88,6 +88,7 @@ def optimize(
     key: PRNGKeyArray,
     *,
     batch: int | None = None,
+    initial: Plans | None = None,
 ) -> Optimum:
     """Search for a plan of low cost; pure, so that `jit` and `vmap` apply.
 
@@ -99,9 +100,11 @@ def optimize(
         key: key of the random draws.
         batch: number of plans evaluated at a time under one `vmap`; by default all plans of a
             question.
+        initial: plans to start from, leading axis `B`, as `space.plans` makes them of actions.
 
     Raises:
-        ValueError: if the key is no key, or `batch` is no number of plans.
+        ValueError: if the key is no key, `batch` is no number of plans, or the shapes of `initial`
+            are not those of plans.
     """
     if batch is not None:
         require_count("batch", batch, 1)
@@ -120,7 +123,7 @@ def optimize(
         progress, recorded = jax.lax.scan(exchange, first, keys)
         return progress, finish(stage, space, progress), recorded
 
-    searching = search(algorithm, space, key, run_stage)
+    searching = search(algorithm, space, key, run_stage, initial)
     (found,) = answered([searching], lambda asked: [evaluate(*each) for each in asked])
     return found
 
@@ -150,7 +153,11 @@ def _step(search: Search, told: Told | None) -> Any:
 
 
 def search(
-    algorithm: Algorithm | Sequence, space: ActionSpace, key: PRNGKeyArray, run_stage: RunStage
+    algorithm: Algorithm | Sequence,
+    space: ActionSpace,
+    key: PRNGKeyArray,
+    run_stage: RunStage,
+    initial: Plans | None = None,
 ) -> Search:
     """Run the algorithms one after another, for both drivers.
 
@@ -159,13 +166,19 @@ def search(
         space: space of plans to search.
         key: key of the random draws.
         run_stage: function that runs the exchanges of one algorithm.
+        initial: plans to start from, leading axis `B`; None for none.
 
     Yields:
-        The questions of `run_stage`; and the plan that is returned, for its cost, if an algorithm's
-        answer is not the best plan.
+        The plans to start from; the questions of `run_stage`; and the plan that is returned, for
+        its cost, if an algorithm's answer is not the best plan.
     """
     _require_key(key)
     archive, failed = empty_archive(space, archive_size(algorithm)), jnp.zeros((), jnp.int32)
+    if initial is not None:
+        _require_plans(space, initial)
+        told = finite((yield "cost", space.actions(initial)))
+        archive = archived(archive, space, initial, told.costs)
+        failed = failed + jnp.sum(jnp.isinf(told.costs), dtype=jnp.int32)
     records = []
     for index, stage in enumerate(stages(algorithm)):
         own = jax.random.fold_in(key, index) if index else key
@@ -180,6 +193,17 @@ def search(
         failed = failed + jnp.isinf(cost)
     best_costs = jnp.concatenate([costs for costs, _ in records])
     return Optimum(actions, cost, archive, best_costs, tuple(trace for _, trace in records), failed)
+
+
+def _require_plans(space: ActionSpace, plans: Plans) -> None:
+    """Raise a `ValueError` unless the shapes are those of several plans of a space."""
+    shape = (space.num_actions, space.num_pickers)
+    choice, direction = np.shape(plans.choice), np.shape(plans.direction)
+    if len(choice) != 3 or choice[1:] != shape or not choice[0] or direction != (*choice, 3):
+        raise ValueError(
+            f"initial has choice of shape {choice} and direction of shape {direction}; give shapes "
+            f"(B, {shape[0]}, {shape[1]}) and (B, {shape[0]}, {shape[1]}, 3)"
+        )
 
 
 def _require_key(key: Any) -> None:

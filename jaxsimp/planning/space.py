@@ -1,5 +1,6 @@
 """The space of plans: candidates, limits, and plans in units of the limits."""
 
+import reprlib
 from dataclasses import dataclass
 from functools import partial
 
@@ -9,6 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsimp.dynamics import NONE, Actions
+
+ROUNDING = 1e-5
+"""Excess of a displacement over its limit that counts as rounding, in units of the limits."""
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["choice", "direction"], meta_fields=[])
@@ -51,6 +55,41 @@ class ActionSpace:
         ids = jnp.append(self.candidates, NONE)
         limits = jnp.broadcast_to(self.limits, plans.direction.shape)
         return Actions(ids[plans.choice], plans.direction * limits)
+
+    def plans(self, actions: Actions) -> Plans:
+        """Plans of given actions, the inverse of `actions`: for a search that starts from them.
+
+        Args:
+            actions: the plans, shapes (*B, T, G) and (*B, T, G, 3); not under `jit`.
+
+        Raises:
+            ValueError: if a shape is not of this space, a pick is neither a candidate nor `NONE`,
+                or a displacement is beyond the limits.
+        """
+        pick, moves = np.asarray(actions.pick), np.asarray(actions.displacement)
+        shape = (self.num_actions, self.num_pickers)
+        if pick.shape[-2:] != shape or moves.shape != (*pick.shape, 3):
+            raise ValueError(
+                f"the plans have pick of shape {pick.shape} and displacement of shape "
+                f"{moves.shape}; give shapes (*B, {shape[0]}, {shape[1]}), and those with 3"
+            )
+        ids = np.append(np.asarray(self.candidates), NONE)
+        equal = pick[..., None] == ids
+        if not equal.any(axis=-1).all():
+            wrong = pick[~equal.any(axis=-1)][0]
+            raise ValueError(
+                f"a plan to start from picks particle {wrong}, which is no candidate; give plans "
+                f"that pick of {reprlib.repr(ids[:-1].tolist())}, or this candidate, too"
+            )
+        direction = moves / np.asarray(self.limits)
+        largest = np.abs(direction).max(initial=0.0)
+        if not largest <= 1 + ROUNDING:
+            raise ValueError(
+                f"a plan to start from has a displacement of {largest:.4g} limits; give at most "
+                f"the limits, {np.asarray(self.limits).tolist()} m along x, y, z"
+            )
+        direction = np.clip(direction, -1.0, 1.0)
+        return Plans(jnp.asarray(equal.argmax(axis=-1)), jnp.asarray(direction, float))
 
 
 def as_candidates(

@@ -74,7 +74,8 @@ def costs_alone(task: Task, members: Ensemble, index: int) -> np.ndarray:
             jnp.concatenate([displacement, jnp.zeros((1, 2, 3))]),
         )
         _, frames = jit_rollout(simulation, pickers, at_rest(episode.start), actions)
-        found.append(sum(float(task.terminal_cost(episode, at_rest(frame))) for frame in frames))
+        *running, last = (float(task.terminal_cost(episode, at_rest(frame))) for frame in frames)
+        found.append(task.running_weight * sum(running) + last)
     return np.array(found)
 
 

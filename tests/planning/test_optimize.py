@@ -19,6 +19,7 @@ from jaxsimp.planning import (
     ActionSpace,
     Algorithm,
     Descent,
+    LocalSearch,
     Planner,
     RandomShooting,
     Reranking,
@@ -100,6 +101,8 @@ ALGORITHMS = {
     "random shooting": RandomShooting(num_asks=5, num_plans=24),
     "descent": Sequence((SHORT, Descent(num_asks=8, num_starts=3))),
     "reranking": Sequence((SHORT, Reranking(num_starts=4))),
+    "local search": Sequence((SHORT, LocalSearch(num_starts=3))),
+    "local search by cost": Sequence((SHORT, LocalSearch((0.1, 0.05), 24, wants="cost"))),
     "all": Sequence((SHORT, Descent(num_asks=4, num_starts=2), Reranking(num_starts=3))),
     "two": Sequence((RandomShooting(num_asks=1, num_plans=24), SHORT)),
 }
@@ -151,6 +154,8 @@ def test_a_search_is_seeded_improves_and_tells_what_it_returns(algorithm):
         (Descent, "learning_rate", 0.0),
         (Descent, "learning_rate", float("nan")),
         (Reranking, "num_starts", 0),
+        (LocalSearch, "num_plans", 0),
+        (LocalSearch, "num_starts", 0),
     ],
 )
 def test_settings_out_of_range_are_refused(kind, name, value):

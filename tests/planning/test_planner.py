@@ -196,7 +196,9 @@ def test_as_many_of_each_are_planned_side_by_side():
     for counts in ((0, 0), (2, 1), (1, 2)):
         with pytest.raises(ValueError, match=r"there are .* give as many of each, at least one"):
             planner().plan_batch([episode] * counts[0], [CANDIDATES] * counts[1], ALGORITHM)
-    with pytest.raises(ValueError, match=r"1 sets of candidates and 2 seeds; give as many"):
+    with pytest.raises(
+        ValueError, match=r"1 sets of candidates, 2 seeds and 1 initial plans; give as many"
+    ):
         planner().plan_batch([episode], [CANDIDATES], ALGORITHM, [0, 1])
 
 
@@ -378,8 +380,10 @@ def test_a_plan_does_not_depend_on_what_was_planned_before(first):
     alone = wanted.plan(episode, candidates, with_population(12)).optimum
     np.testing.assert_array_equal(found.best_costs, alone.best_costs)
     assert found.cost == alone.cost
-    sizes = {size for _, size in used._maps}
-    assert sizes == {first, 12}  # none was padded to the size of another, nor compiled for one plan
+    assert set(used._evaluations.sizes("cost")) == {
+        first,
+        12,
+    }  # none was padded to the size of another, nor compiled for one plan
 
 
 def test_a_plan_of_another_length_is_refused():
