@@ -218,7 +218,7 @@ class CoarseToFinePlanner:
         """
         return self.planners[-1].execute(episode, actions)
 
-    def _ids(self, candidates: Candidates) -> list[Int[np.ndarray, " K"]]:
+    def _ids(self, candidates: Candidates) -> list[Int[np.ndarray, " J"]]:
         """Ids of the candidates in each body, the coarsest first; no particle is there twice."""
         given = candidates.particles if isinstance(candidates, KeyPoints) else candidates
         fine = self.task.body
