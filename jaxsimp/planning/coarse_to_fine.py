@@ -28,9 +28,9 @@ from jaxsimp.tasks.episode import require_episode
 
 SHARED = ("num_actions", "num_pickers", "limits", "action_seconds")
 """Settings that the tasks must share, for one plan to serve all."""
-REFINEMENT = LocalSearch((0.1, 0.08, 0.06, 0.05, 0.04, 0.03))
+REFINEMENT = LocalSearch((0.1, 0.08, 0.06, 0.05))
 """Refinement between the coarsest body and the finest."""
-LAST_REFINEMENT = LocalSearch((0.03,))
+LAST_REFINEMENT = LocalSearch((0.06, 0.04))
 """Refinement on the finest body, after others."""
 
 
@@ -82,7 +82,7 @@ class CoarseToFinePlanner:
                 default need one in JAX.
             layout: layout of populations on this machine; by default the fastest in measurements.
             refinements: an algorithm for each body but the coarsest; by default local searches, of
-                six rounds between the coarsest and the finest body and one on the finest; of three
+                four rounds between the coarsest and the finest body and two on the finest; of three
                 if there are but two bodies.
 
         Raises:
@@ -153,7 +153,8 @@ class CoarseToFinePlanner:
             new_ids[ids[level]] = ids[level + 1]
             start = self._episode(planner, episode)
             initial = renamed(starts, new_ids)
-            parts.append(planner.plan(start, ids[level + 1], refinement, seed, on_ask, initial))
+            own = _own_seed(seed, level)
+            parts.append(planner.plan(start, ids[level + 1], refinement, own, on_ask, initial))
         sums = ("num_rollouts", "price", "seconds", "compile_seconds")
         return RefinedPlan(
             actions=parts[-1].actions,
@@ -257,6 +258,11 @@ def _refinements(
     for each in given:
         stages(each)  # raises for what is no algorithm
     return tuple(given)
+
+
+def _own_seed(seed: int, level: int) -> int:
+    """A seed for each refinement: with one for all, each would draw the noise of the one before."""
+    return int(np.random.SeedSequence(seed, spawn_key=(level,)).generate_state(1)[0])
 
 
 def _num_starts(refinement: Algorithm | Sequence) -> int:
