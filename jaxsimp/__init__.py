@@ -109,9 +109,9 @@ if TYPE_CHECKING:
         Planner,
         Plans,
         RandomShooting,
-        RefinedPlan,
         Reranking,
         Sequence,
+        StagedPlanner,
         carry_over,
         default_algorithm,
         make_problem,
@@ -174,7 +174,6 @@ __all__ = [
     "Plans",
     "RandomShooting",
     "Recording",
-    "RefinedPlan",
     "Reranking",
     "SavedPlan",
     "SearchEngine",
@@ -182,6 +181,7 @@ __all__ = [
     "Simulation",
     "Sphere",
     "Spread",
+    "StagedPlanner",
     "State",
     "Subgoal",
     "Table",
@@ -256,7 +256,7 @@ _ROOMS = {
     "goals": "Subgoal find_folds same_folds subgoals",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical CoarseToFinePlanner Descent "
     "Encoding GaussianIndex Joint LocalSearch Optimum Plan Planner Plans RandomShooting "
-    "RefinedPlan Reranking Sequence carry_over default_algorithm make_problem optimize "
+    "Reranking Sequence StagedPlanner carry_over default_algorithm make_problem optimize "
     "search_on_host",
     "records": "SavedPlan load_plan save_plan",
     "simplification": "METHODS FitStatus KeyPoints Workspace simplify simplify_batch",

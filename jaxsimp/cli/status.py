@@ -34,8 +34,8 @@ def exit_status(run: Callable[[], int], interrupted: str = "interrupted", again:
     """Run a command, and turn errors and signals into an exit status.
 
     Args:
-        run: the command; returns its own exit status. A `ValueError` or an `OSError` that it
-            raises is printed to the standard error stream, in one line.
+        run: the command; returns its own exit status. A `ValueError`, an `OSError` or an
+            `ImportError` that it raises is printed to the standard error stream, in one line.
         interrupted: text to print after Ctrl-C, SIGTERM or SIGHUP. A second signal ends the
             process at once.
         again: text to print after an `OSError`, such as a full disk: how to go on.
@@ -46,7 +46,7 @@ def exit_status(run: Callable[[], int], interrupted: str = "interrupted", again:
     except OSError as error:
         _print_error(_told(error) + (again and f"; {again}"))
         return REFUSED
-    except ValueError as error:
+    except (ValueError, ImportError) as error:  # of an extra that is not installed
         _print_error(str(error))
         return REFUSED
     except KeyboardInterrupt as ended:

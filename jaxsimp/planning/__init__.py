@@ -8,7 +8,7 @@ from jaxsimp.planning.algorithm import PRICES, Algorithm, Defaults, Sequence, To
 from jaxsimp.planning.archive import Archive
 from jaxsimp.planning.between_bodies import carry_over
 from jaxsimp.planning.cem import CEM
-from jaxsimp.planning.coarse_to_fine import CoarseToFinePlanner, RefinedPlan
+from jaxsimp.planning.coarse_to_fine import CoarseToFinePlanner
 from jaxsimp.planning.default import default_algorithm
 from jaxsimp.planning.descent import Descent
 from jaxsimp.planning.encodings import ENCODINGS, Categorical, Encoding, GaussianIndex, Joint
@@ -20,6 +20,7 @@ from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_sp
 from jaxsimp.planning.random_shooting import RandomShooting
 from jaxsimp.planning.reranking import Reranking
 from jaxsimp.planning.space import ActionSpace, Plans
+from jaxsimp.planning.stages import StagedPlanner, stage_algorithm
 
 __all__ = [
     "CEM",
@@ -43,9 +44,9 @@ __all__ = [
     "Plans",
     "Problem",
     "RandomShooting",
-    "RefinedPlan",
     "Reranking",
     "Sequence",
+    "StagedPlanner",
     "TaskProblem",
     "Told",
     "Wants",
@@ -56,4 +57,5 @@ __all__ = [
     "optimize",
     "price",
     "search_on_host",
+    "stage_algorithm",
 ]

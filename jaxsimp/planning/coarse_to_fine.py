@@ -7,7 +7,6 @@ few of a local search, with self-contact, on the fine one.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from jaxsimp.engines import Engine, Execution, Layout, SearchEngine
 from jaxsimp.planning.algorithm import Algorithm, Sequence, stages
 from jaxsimp.planning.between_bodies import carried_positions, nearest_particles, renamed
 from jaxsimp.planning.local_search import LocalSearch
-from jaxsimp.planning.planner import Plan, Planner
+from jaxsimp.planning.planner import Plan, Planner, combined
 from jaxsimp.planning.problem import Candidates, action_space
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints
@@ -28,26 +27,10 @@ from jaxsimp.tasks.episode import require_episode
 
 SHARED = ("num_actions", "num_pickers", "limits", "action_seconds")
 """Settings that the tasks must share, for one plan to serve all."""
-REFINEMENT = LocalSearch((0.1, 0.08, 0.06, 0.05, 0.04, 0.03))
+REFINEMENT = LocalSearch((0.1, 0.08, 0.06, 0.05))
 """Refinement between the coarsest body and the finest."""
-LAST_REFINEMENT = LocalSearch((0.03,))
+LAST_REFINEMENT = LocalSearch((0.06, 0.04))
 """Refinement on the finest body, after others."""
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedPlan(Plan):
-    """A plan that was searched for on a coarse body and refined on finer ones.
-
-    `actions` and `optimum` are of the finest body; `num_rollouts`, `price`, `seconds` and
-    `compile_seconds` are sums over all bodies. A rollout counts the same on each, though one of a
-    cloth of 100 x 100 takes over a hundred times as long as one of 25 x 25: compare prices between
-    plans of the same resolutions only, and seconds otherwise.
-
-    Attributes:
-        parts: the plan of each body, the coarsest first, and the record of its search.
-    """
-
-    parts: tuple[Plan, ...]
 
 
 class CoarseToFinePlanner:
@@ -82,7 +65,7 @@ class CoarseToFinePlanner:
                 default need one in JAX.
             layout: layout of populations on this machine; by default the fastest in measurements.
             refinements: an algorithm for each body but the coarsest; by default local searches, of
-                six rounds between the coarsest and the finest body and one on the finest; of three
+                four rounds between the coarsest and the finest body and two on the finest; of three
                 if there are but two bodies.
 
         Raises:
@@ -128,8 +111,12 @@ class CoarseToFinePlanner:
         algorithm: Algorithm | Sequence | None = None,
         seed: int = 0,
         on_ask: Callable[[], None] = lambda: None,
-    ) -> RefinedPlan:
+    ) -> Plan:
         """Search for a plan on the coarsest body, and refine it on the finer ones.
+
+        Its `parts` are the plans of the bodies. The price counts a rollout of each alike, though a
+        cloth of 100 x 100 takes over a hundred times as long as one of 25 x 25: compare prices of
+        the same resolutions only, and seconds otherwise.
 
         Args:
             episode: start and goal of the fine body.
@@ -153,14 +140,9 @@ class CoarseToFinePlanner:
             new_ids[ids[level]] = ids[level + 1]
             start = self._episode(planner, episode)
             initial = renamed(starts, new_ids)
-            parts.append(planner.plan(start, ids[level + 1], refinement, seed, on_ask, initial))
-        sums = ("num_rollouts", "price", "seconds", "compile_seconds")
-        return RefinedPlan(
-            actions=parts[-1].actions,
-            optimum=parts[-1].optimum,
-            **{name: sum(getattr(part, name) for part in parts) for name in sums},
-            parts=tuple(parts),
-        )
+            own = _own_seed(seed, level)
+            parts.append(planner.plan(start, ids[level + 1], refinement, own, on_ask, initial))
+        return combined(parts[-1].actions, parts)
 
     def _episode(self, planner: Planner, episode: Episode) -> Episode:
         """The episode of a planner's body that lies where the fine one lies."""
@@ -218,7 +200,7 @@ class CoarseToFinePlanner:
         """
         return self.planners[-1].execute(episode, actions)
 
-    def _ids(self, candidates: Candidates) -> list[Int[np.ndarray, " K"]]:
+    def _ids(self, candidates: Candidates) -> list[Int[np.ndarray, " J"]]:
         """Ids of the candidates in each body, the coarsest first; no particle is there twice."""
         given = candidates.particles if isinstance(candidates, KeyPoints) else candidates
         fine = self.task.body
@@ -257,6 +239,11 @@ def _refinements(
     for each in given:
         stages(each)  # raises for what is no algorithm
     return tuple(given)
+
+
+def _own_seed(seed: int, level: int) -> int:
+    """A seed for each refinement: with one for all, each would draw the noise of the one before."""
+    return int(np.random.SeedSequence(seed, spawn_key=(level,)).generate_state(1)[0])
 
 
 def _num_starts(refinement: Algorithm | Sequence) -> int:

@@ -46,6 +46,7 @@ class Plan:
         seconds: search time without compilation, seconds.
         compile_seconds: compilation time, seconds; near 0 if an earlier plan had the same number
             of candidates and the same algorithm.
+        parts: the plans of several searches that it was made from; empty for one search.
     """
 
     actions: Actions
@@ -54,6 +55,27 @@ class Plan:
     price: int
     seconds: float
     compile_seconds: float
+    parts: tuple["Plan", ...] = ()
+
+
+def combined(actions: Actions, parts: Seq[Plan], num_rollouts: int = 0, price: int = 0) -> Plan:
+    """A plan made from those of several searches: the last one's optimum, and sums of the rest.
+
+    Args:
+        actions: the plan.
+        parts: the plans of the searches.
+        num_rollouts: number of plans evaluated between the searches.
+        price: price of these, in rollouts.
+    """
+    return Plan(
+        actions=actions,
+        optimum=parts[-1].optimum,
+        num_rollouts=num_rollouts + sum(part.num_rollouts for part in parts),
+        price=price + sum(part.price for part in parts),
+        seconds=sum(part.seconds for part in parts),
+        compile_seconds=sum(part.compile_seconds for part in parts),
+        parts=tuple(parts),
+    )
 
 
 class Planner:

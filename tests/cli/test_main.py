@@ -96,7 +96,7 @@ def test_a_command_keeps_its_own_status(status, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("error", [ValueError("[a]\n  b"), OSError("[a] b")])
+@pytest.mark.parametrize("error", [ValueError("[a]\n  b"), OSError("[a] b"), ImportError("[a] b")])
 def test_a_users_error_is_one_line_whatever_is_in_it(error, capsys):
     def run():
         raise error

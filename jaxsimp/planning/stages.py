@@ -1,0 +1,233 @@
+"""Goals of several folds, planned in stages: sub-goal after sub-goal.
+
+The folds of the final goal give full intermediate configurations (`jaxsimp.goals.subgoals`). Each
+is planned from the state that the last stage really left, over the key points that it moves; one
+search in one piece has to find all folds at once, which the paper names as its open problem.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxsimp.dynamics import NONE, Actions
+from jaxsimp.engines import Engine, Execution, Layout, SearchEngine
+from jaxsimp.engines.rollouts import as_float
+from jaxsimp.goals import Positions, Subgoal, subgoals
+from jaxsimp.goals.panels import fit_isometry
+from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence
+from jaxsimp.planning.cem import CEM
+from jaxsimp.planning.encodings import Joint
+from jaxsimp.planning.planner import Plan, Planner, combined
+from jaxsimp.planning.problem import Candidates
+from jaxsimp.planning.reranking import Reranking
+from jaxsimp.planning.space import ActionSpace, as_candidates
+from jaxsimp.simplification import KeyPoints
+from jaxsimp.tasks import Episode, Task
+from jaxsimp.tasks.costs import distance_cost
+from jaxsimp.tasks.episode import require_episode
+
+STAGE_ACTIONS = 2
+"""Number of actions of a stage: up and across, and down."""
+MOVED = 0.1
+"""Least distance between a stage's start and its sub-goal, in sizes of the body, for a particle to
+be a candidate that does not belong to the panels turned over."""
+SAME = 1e-3
+"""Largest misfit of two goals that are one goal laid elsewhere, in sizes of the body."""
+
+
+def stage_algorithm(*, reranks: bool = True) -> Sequence:
+    """The default search of a stage: CEM on costs in two fidelities, then the best by score.
+
+    Chosen on cloths of 17 by 17 particles, with seeds from 200.
+
+    Args:
+        reranks: whether plans are looked at in the evaluator's physics, which must be in JAX.
+    """
+    if not reranks:
+        return Sequence((CEM(num_iterations=10, encoding=Joint()),))
+    return Sequence((CEM(num_iterations=5, encoding=Joint(), wants="screened"), Reranking()))
+
+
+class StagedPlanner:
+    """Planner of a task whose goal has folds, with the functions of `Planner`.
+
+    A plan has `STAGE_ACTIONS` actions for each fold, and between folds as many idle ones as the
+    task's body settles for; it is carried out and saved as any other.
+
+    Attributes:
+        subgoals: the sub-goals of the task's goal.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        engine: SearchEngine | None = None,
+        evaluator: Engine | None = None,
+        layout: Layout | None = None,
+    ) -> None:
+        """Find the sub-goals, and make the planners; compilation waits until it is needed.
+
+        Args:
+            task: the task; its `num_actions` does not count.
+            engine: engine that gives the costs of plans, see `Planner`.
+            evaluator: engine that carries out plans, see `Planner`.
+            layout: layout of populations on this machine; by default the fastest in measurements.
+
+        Raises:
+            ValueError: if `jaxsimp.goals.find_folds` refuses the goal, the goal has no folds, or
+                `Planner` raises.
+        """
+        self.subgoals = subgoals(task.body, task.goal)
+        if not self.subgoals:
+            raise ValueError(
+                f"the goal of {task.name} has no folds; plan for it in one piece, with Planner"
+            )
+        self._goal = np.asarray(task.goal, float)
+        stage = dataclasses.replace(
+            task,
+            num_actions=STAGE_ACTIONS,
+            running_cost=distance_cost,
+            terminal_cost=distance_cost,
+        )
+        self._stage = Planner(stage, engine, evaluator, layout)
+        count = len(self.subgoals)
+        chained = count * STAGE_ACTIONS + (count - 1) * task.settle_actions
+        whole = dataclasses.replace(task, num_actions=chained)
+        self._whole = Planner(whole, engine, evaluator, layout)
+
+    @property
+    def task(self) -> Task:
+        """The task, with as many actions as plans have."""
+        return self._whole.task
+
+    @property
+    def engine(self) -> SearchEngine:
+        """Engine that gives the costs of plans."""
+        return self._whole.engine
+
+    @property
+    def evaluator(self) -> Engine:
+        """Engine that carries out plans, and scores them."""
+        return self._whole.evaluator
+
+    def plan(
+        self,
+        episode: Episode,
+        candidates: Candidates,
+        algorithm: Algorithm | Sequence | None = None,
+        seed: int = 0,
+        on_ask: Callable[[], None] = lambda: None,
+    ) -> Plan:
+        """Search for a plan, stage by stage.
+
+        Its `optimum` is that of the last stage, and its `parts` are the stages. Carrying out a
+        stage, to know where it leaves the body, counts as a settled score.
+
+        Args:
+            episode: start and goal; the goal is that of the task, laid anywhere, or another one.
+            candidates: particles that a picker may grasp. In each stage those of the panels that
+                turn over, and those that are to move more than `MOVED`; all if that leaves none.
+            algorithm: algorithm of each stage; `stage_algorithm` by default.
+            seed: seed of the random draws.
+            on_ask: function called after each question of the algorithm.
+
+        Raises:
+            ValueError: as `Planner.plan`; or if the goal of the episode is not that of the task,
+                and `jaxsimp.goals.find_folds` refuses it or finds another number of folds.
+        """
+        body = self.task.body
+        episode = as_float(require_episode(episode, body.num_particles))
+        given = candidates.particles if isinstance(candidates, KeyPoints) else candidates
+        ids = as_candidates(given, body.num_particles)
+        if algorithm is None:
+            algorithm = stage_algorithm(reranks=isinstance(self.evaluator, SearchEngine))
+        parts: list[Plan] = []
+        start = episode.start
+        ends = self._ends(np.asarray(episode.goal, float))
+        for index, (each, end) in enumerate(zip(self.subgoals, ends, strict=True)):
+            stage = Episode(start, end)
+            own = _candidates(ids, each.moving, start, end, MOVED * body.size)
+            parts.append(self._stage.plan(stage, own, algorithm, _seed(seed, index), on_ask))
+            if index + 1 < len(ends):
+                left = self._stage.execute(stage, parts[-1].actions).positions[-1]
+                start = left if np.isfinite(left).all() else start
+        return combined(
+            _chained([part.actions for part in parts], self.task.settle_actions),
+            parts,
+            num_rollouts=len(parts) - 1,
+            price=(len(parts) - 1) * PRICES["settled"],
+        )
+
+    def _ends(self, goal: Positions) -> list[Positions]:
+        """Positions of the sub-goals where the goal of an episode lies."""
+        own, wanted = (p[:, 0] + 1j * p[:, 1] for p in (self._goal, goal))
+        turn, shift, mirrored = fit_isometry(own, wanted)
+        misfit = np.abs(turn * own + shift - wanted), np.abs(self._goal - goal)[:, 2]
+        if mirrored or np.max(misfit) > SAME * self.task.body.size:
+            return self._ends_of(subgoals(self.task.body, goal))
+        ends = [np.array(each.positions, float) for each in self.subgoals]
+        for end in ends:
+            place = turn * (end[:, 0] + 1j * end[:, 1]) + shift
+            end[:, 0], end[:, 1] = place.real, place.imag
+        return ends
+
+    def _ends_of(self, found: tuple[Subgoal, ...]) -> list[Positions]:
+        if len(found) != len(self.subgoals):
+            raise ValueError(
+                f"the goal of the episode has {len(found)} folds and that of the task "
+                f"{len(self.subgoals)}; make a planner of a task with this goal"
+            )
+        return [np.asarray(each.positions, float) for each in found]
+
+    def prepare(self, algorithm: Algorithm | Sequence, space: ActionSpace | None = None) -> float:
+        """Compile the functions of a stage, see `Planner.prepare`."""
+        return self._stage.prepare(algorithm, space)
+
+    def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
+        """Estimate the time of all stages, see `Planner.estimate_seconds`."""
+        return len(self.subgoals) * self._stage.estimate_seconds(algorithm)
+
+    def layout_of(self, algorithm: Algorithm) -> Layout:
+        """Layout of an algorithm's questions on this machine."""
+        return self._stage.layout_of(algorithm)
+
+    def execute(self, episode: Episode, actions: Actions) -> Execution:
+        """Carry out a whole plan in the evaluator's physics, let the body settle, and score it.
+
+        Raises:
+            ValueError: if the episode or the plan is not of the task.
+        """
+        return self._whole.execute(episode, actions)
+
+
+def _candidates(
+    ids: Int[np.ndarray, " K"],
+    moving: Bool[np.ndarray, " N"],
+    start: Any,
+    end: Any,
+    least: float,
+) -> Int[np.ndarray, " _"]:
+    """The candidates that a stage moves; all of them if it moves none."""
+    far = np.linalg.norm(np.asarray(end) - np.asarray(start), axis=1) > least
+    own = ids[(moving | far)[ids]]
+    return own if len(own) else ids
+
+
+def _seed(seed: int, stage: int) -> int:
+    """The seed of a stage: stages draw by themselves."""
+    return int(np.random.SeedSequence((seed, stage)).generate_state(1)[0]) if stage else seed
+
+
+def _chained(plans: list[Actions], idle: int) -> Actions:
+    """One plan of several, with idle actions between them."""
+    num_pickers = plans[0].pick.shape[-1]
+    nothing = jnp.full((idle, num_pickers), NONE), jnp.zeros((idle, num_pickers, 3), float)
+    picks, moves = [plans[0].pick], [plans[0].displacement]
+    for each in plans[1:]:
+        picks += [nothing[0], each.pick]
+        moves += [nothing[1], each.displacement]
+    return Actions(jnp.concatenate(picks), jnp.concatenate(moves))
