@@ -13,12 +13,13 @@ from experiments.planners import (
     NamedPlanner,
     Search,
     cem_of,
+    num_folds,
     settings,
     with_cem,
 )
 from jaxsimp.checks import require_count, require_seed
 from jaxsimp.engines import MassSprings, SearchEngine, Spread, make_ensemble
-from jaxsimp.planning import ENCODINGS
+from jaxsimp.planning import ENCODINGS, Planner, StagedPlanner, staged_task
 from jaxsimp.simplification import METHODS
 from jaxsimp.tasks import Task, make_task, task_names
 
@@ -114,8 +115,20 @@ class PlanStudy:
 
     def task(self, name: str, planner: str | None = None) -> Task:
         """A task at this study's scale, as a planner changes it; by default the first planner."""
+        planner = planner or self.planners[0]
         task = make_task(name, self.resolution, quick=self.quick)
-        return self.named(planner or self.planners[0]).task(task, self.num_actions)
+        changed = self.named(planner).task(task, self.num_actions)
+        return staged_task(changed, num_folds(task)) if self.in_stages(task, planner) else changed
+
+    def in_stages(self, task: Task, planner: str) -> bool:
+        """Whether a planner plans for a task in stages."""
+        return self.named(planner).in_stages and num_folds(task) > 1 and self.num_actions is None
+
+    def planner(self, name: str, planner: str) -> Planner | StagedPlanner:
+        """A planner of a task, by their names."""
+        task = self.task(name, planner)
+        kind = StagedPlanner if self.in_stages(task, planner) else Planner
+        return kind(task, self.engine(task), self.evaluator())
 
     def search(self, task: Task, planner: str) -> Search:
         """The search of a planner for plans of a task."""

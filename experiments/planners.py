@@ -3,10 +3,12 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+from jaxsimp.goals import find_folds
 from jaxsimp.planning import (
     CEM,
     PRICES,
@@ -17,9 +19,10 @@ from jaxsimp.planning import (
     Reranking,
     Sequence,
     default_algorithm,
+    stage_algorithm,
 )
 from jaxsimp.planning.algorithm import stages
-from jaxsimp.tasks import Task
+from jaxsimp.tasks import Task, make_task
 
 Search = Algorithm | Sequence
 
@@ -29,13 +32,15 @@ class NamedPlanner:
     """A search, and what it changes of a task.
 
     Attributes:
-        search: the search for plans of a task.
+        search: the search for plans of a task, or of each stage.
+        in_stages: whether goals of several folds are planned in stages.
         num_actions: number of actions in a plan, instead of the task's.
         limit: largest displacement along each axis, metres, instead of the task's.
         running_weight: weight of the running costs, instead of the task's.
     """
 
     search: Callable[[Task], Search]
+    in_stages: bool = False
     num_actions: int | None = None
     limit: float | None = None
     running_weight: float | None = None
@@ -89,8 +94,33 @@ def _smoke(task: Task) -> Sequence:
     return Sequence((cem, Descent(2), Reranking(2)))
 
 
+def _default(task: Task) -> Sequence:
+    return stage_algorithm() if num_folds(task) > 1 else default_algorithm(task)
+
+
+def _one_piece(task: Task) -> CEM:
+    # It finds several folds one after another, and must not converge on the first.
+    return CEM(num_iterations=40, smoothing=0.2, encoding=Joint())
+
+
+def num_folds(task: Task) -> int:
+    """Number of folds of a task's goal; 0 if it has none, or none are found."""
+    return _num_folds(task.name, task.resolution) if len(task.body.faces) else 0
+
+
+@cache
+def _num_folds(name: str, resolution: int) -> int:
+    task = make_task(name, resolution)
+    try:
+        return len(find_folds(task.body, task.goal))
+    except ValueError:
+        return 0
+
+
 PLANNERS = {
-    "default": NamedPlanner(default_algorithm),
+    "default": NamedPlanner(_default, in_stages=True),
+    # Goals of several folds by one search.
+    "one_piece": NamedPlanner(_one_piece),
     # The default without one of its parts, at its price.
     "without_descent": NamedPlanner(_without_descent),
     "without_reranking": NamedPlanner(_without_reranking),
@@ -100,7 +130,7 @@ PLANNERS = {
     # The author's own settings.
     "paper": NamedPlanner(_paper, num_actions=15, limit=0.08, running_weight=1.0),
 }
-SMOKE = NamedPlanner(_smoke)
+SMOKE = NamedPlanner(_smoke, in_stages=True)
 """What every planner is in a study at smoke size."""
 
 

@@ -19,7 +19,7 @@ from experiments.progress import progress_bar
 from experiments.study import teller
 from jaxsimp import goals, records
 from jaxsimp.engines import Execution, goal_scores
-from jaxsimp.planning import ENCODINGS, Planner
+from jaxsimp.planning import ENCODINGS, Planner, StagedPlanner
 from jaxsimp.planning.algorithm import stages
 from jaxsimp.simplification import KeyPoints, simplify
 from jaxsimp.tasks import Task
@@ -125,7 +125,7 @@ def run_study(
     for name, model in models.items():
         console.print(f"{name}: {len(model)} key points {model.particles.tolist()}")
     if todo := rows.left(study.runs()):
-        _run_all(study, tasks, models, todo, folder, environment, console)
+        _run_all(study, models, todo, folder, environment, console)
     return {
         "environment": environment,
         "models": [_model_row(study, name, model) for name, model in models.items()],
@@ -135,7 +135,6 @@ def run_study(
 
 def _run_all(
     study: PlanStudy,
-    tasks: Tasks,
     models: dict[str, KeyPoints],
     todo: list[Run],
     folder: Path,
@@ -150,10 +149,10 @@ def _run_all(
     }
     left = {pair: runs for pair, runs in left.items() if runs}
     for pair, runs in left.items():
-        task, told = tasks[pair], _told(study, *pair)
+        told = _told(study, *pair)
         console.print(f"{told}: compiling")
-        planners[pair] = Planner(task, study.engine(task), study.evaluator())
-        search = study.search(task, pair[1])
+        planners[pair] = study.planner(*pair)
+        search = study.search(planners[pair].task, pair[1])
         compiled[pair] = planners[pair].prepare(search)
         seconds[pair] = planners[pair].estimate_seconds(search) * len(runs)
         console.print(
@@ -164,8 +163,10 @@ def _run_all(
     with progress_bar(console) as progress:
         for pair, runs in left.items():
             planner, compile_seconds = planners[pair], compiled[pair]
-            search = study.search(planner.task, pair[1])
-            bar = progress.add_task(_told(study, *pair), total=len(runs) * num_asks(search))
+            search, searches = study.search(planner.task, pair[1]), num_searches(planner)
+            bar = progress.add_task(
+                _told(study, *pair), total=len(runs) * num_asks(search) * searches
+            )
             for run in runs:
                 advance = partial(progress.advance, bar)
                 row = _run(planner, search, models[run.task], run, folder, environment, advance)
@@ -182,7 +183,7 @@ def _told(study: PlanStudy, task: str, planner: str) -> str:
 
 
 def _run(
-    planner: Planner,
+    planner: Planner | StagedPlanner,
     search: Search,
     model: KeyPoints,
     run: Run,
@@ -208,13 +209,17 @@ def _run(
         found={"algorithm": repr(search), "seed": run.seed},
         provenance=environment,
     )
+    searches = plan.parts or (plan,)
+    costs = np.concatenate([each.optimum.best_costs for each in searches])
+    own = np.array(counted_rollouts(search))
+    counted = np.concatenate([own + index * own[-1] for index in range(len(searches))])
     score = execution.score if np.isfinite(execution.score) else None
     return {
         **run._asdict(),
         "num_particles": task.body.num_particles,
         "num_key_points": len(model),
-        "cost_per_question": [finite(float(cost)) for cost in plan.optimum.best_costs],
-        "rollouts_per_question": counted_rollouts(search),
+        "cost_per_question": [finite(float(cost)) for cost in costs],
+        "rollouts_per_question": counted.tolist(),
         "final_cost": finite(float(plan.optimum.cost)),
         "final_score": score,
         "missed_contacts": execution.missed,
@@ -239,7 +244,7 @@ def _same_folds(task: Task, execution: Execution) -> bool | None:
     return goals.same_folds(task.body, task.goal, end) if wanted else None
 
 
-def _row_config(planner: Planner, search: Search) -> dict[str, Any]:
+def _row_config(planner: Planner | StagedPlanner, search: Search) -> dict[str, Any]:
     task = planner.task
     return {
         "search": settings(search),
@@ -252,6 +257,11 @@ def _row_config(planner: Planner, search: Search) -> dict[str, Any]:
         "settle_actions": task.settle_actions,
         "layout": dataclasses.asdict(planner.layout_of(stages(search)[0])),
     }
+
+
+def num_searches(planner: Planner | StagedPlanner) -> int:
+    """Number of searches for one plan."""
+    return planner.num_searches if isinstance(planner, StagedPlanner) else 1
 
 
 def finite(value: float) -> float | None:

@@ -20,7 +20,7 @@ from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_sp
 from jaxsimp.planning.random_shooting import RandomShooting
 from jaxsimp.planning.reranking import Reranking
 from jaxsimp.planning.space import ActionSpace, Plans
-from jaxsimp.planning.stages import StagedPlanner, stage_algorithm
+from jaxsimp.planning.stages import StagedPlanner, stage_algorithm, staged_task
 
 __all__ = [
     "CEM",
@@ -58,4 +58,5 @@ __all__ = [
     "price",
     "search_on_host",
     "stage_algorithm",
+    "staged_task",
 ]

@@ -20,10 +20,11 @@ from jaxsimp.goals import Positions, Subgoal, subgoals
 from jaxsimp.goals.panels import fit_isometry
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence
 from jaxsimp.planning.cem import CEM
+from jaxsimp.planning.descent import Descent
 from jaxsimp.planning.encodings import Joint
+from jaxsimp.planning.local_search import LocalSearch
 from jaxsimp.planning.planner import Plan, Planner, combined
 from jaxsimp.planning.problem import Candidates
-from jaxsimp.planning.reranking import Reranking
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints
 from jaxsimp.tasks import Episode, Task
@@ -35,21 +36,33 @@ STAGE_ACTIONS = 2
 MOVED = 0.1
 """Least distance between a stage's start and its sub-goal, in sizes of the body, for a particle to
 be a candidate that does not belong to the panels turned over."""
+ATTEMPTS = 2
+"""Number of searches for each stage, of which the one that settles best is kept: what a stage leaves
+wrong, no later one cures."""
 SAME = 1e-3
 """Largest misfit of two goals that are one goal laid elsewhere, in sizes of the body."""
 
 
 def stage_algorithm(*, reranks: bool = True) -> Sequence:
-    """The default search of a stage: CEM on costs in two fidelities, then the best by score.
+    """The default search of a stage: as `default_algorithm`, then around the best by score.
 
     Chosen on cloths of 17 by 17 particles, with seeds from 200.
 
     Args:
         reranks: whether plans are looked at in the evaluator's physics, which must be in JAX.
     """
-    if not reranks:
-        return Sequence((CEM(num_iterations=10, encoding=Joint()),))
-    return Sequence((CEM(num_iterations=5, encoding=Joint(), wants="screened"), Reranking()))
+    parts: tuple[Algorithm, ...] = (
+        CEM(num_iterations=10, encoding=Joint()),
+        Descent(num_starts=2),
+    )
+    last = LocalSearch((0.08, 0.05, 0.03), num_plans=16, num_starts=8)
+    return Sequence((*parts, last) if reranks else parts)
+
+
+def staged_task(task: Task, num_folds: int) -> Task:
+    """The task with as many actions as plans in stages have: those of each fold, and idle ones."""
+    idle = (num_folds - 1) * task.settle_actions
+    return dataclasses.replace(task, num_actions=num_folds * STAGE_ACTIONS + idle)
 
 
 class StagedPlanner:
@@ -94,9 +107,7 @@ class StagedPlanner:
             terminal_cost=distance_cost,
         )
         self._stage = Planner(stage, engine, evaluator, layout)
-        count = len(self.subgoals)
-        chained = count * STAGE_ACTIONS + (count - 1) * task.settle_actions
-        whole = dataclasses.replace(task, num_actions=chained)
+        whole = staged_task(task, len(self.subgoals))
         self._whole = Planner(whole, engine, evaluator, layout)
 
     @property
@@ -114,6 +125,11 @@ class StagedPlanner:
         """Engine that carries out plans, and scores them."""
         return self._whole.evaluator
 
+    @property
+    def num_searches(self) -> int:
+        """Number of searches for one plan."""
+        return ATTEMPTS * len(self.subgoals)
+
     def plan(
         self,
         episode: Episode,
@@ -124,8 +140,8 @@ class StagedPlanner:
     ) -> Plan:
         """Search for a plan, stage by stage.
 
-        Its `optimum` is that of the last stage, and its `parts` are the stages. Carrying out a
-        stage, to know where it leaves the body, counts as a settled score.
+        Its `parts` are the searches, `ATTEMPTS` for each stage, and its `optimum` is that of the
+        last one. Carrying out a stage, to know where it leaves the body, counts as a settled score.
 
         Args:
             episode: start and goal; the goal is that of the task, laid anywhere, or another one.
@@ -146,20 +162,27 @@ class StagedPlanner:
         if algorithm is None:
             algorithm = stage_algorithm(reranks=isinstance(self.evaluator, SearchEngine))
         parts: list[Plan] = []
+        chain: list[Actions] = []
         start = episode.start
         ends = self._ends(np.asarray(episode.goal, float))
         for index, (each, end) in enumerate(zip(self.subgoals, ends, strict=True)):
             stage = Episode(start, end)
             own = _candidates(ids, each.moving, start, end, MOVED * body.size)
-            parts.append(self._stage.plan(stage, own, algorithm, _seed(seed, index), on_ask))
-            if index + 1 < len(ends):
-                left = self._stage.execute(stage, parts[-1].actions).positions[-1]
-                start = left if np.isfinite(left).all() else start
+            seeds = [_seed(seed, index, attempt) for attempt in range(ATTEMPTS)]
+            found = self._stage.plan_batch(
+                [stage] * ATTEMPTS, [own] * ATTEMPTS, algorithm, seeds, on_ask
+            )
+            done = [self._stage.execute(stage, plan.actions) for plan in found]
+            best = int(np.argmax([np.nan_to_num(one.score, nan=-np.inf) for one in done]))
+            parts += found
+            chain.append(found[best].actions)
+            left = done[best].positions[-1]
+            start = left if np.isfinite(left).all() else start
         return combined(
-            _chained([part.actions for part in parts], self.task.settle_actions),
+            _chained(chain, self.task.settle_actions),
             parts,
-            num_rollouts=len(parts) - 1,
-            price=(len(parts) - 1) * PRICES["settled"],
+            num_rollouts=len(parts),
+            price=len(parts) * PRICES["settled"],
         )
 
     def _ends(self, goal: Positions) -> list[Positions]:
@@ -189,7 +212,7 @@ class StagedPlanner:
 
     def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
         """Estimate the time of all stages, see `Planner.estimate_seconds`."""
-        return len(self.subgoals) * self._stage.estimate_seconds(algorithm)
+        return self.num_searches * self._stage.estimate_seconds(algorithm)
 
     def layout_of(self, algorithm: Algorithm) -> Layout:
         """Layout of an algorithm's questions on this machine."""
@@ -217,9 +240,9 @@ def _candidates(
     return own if len(own) else ids
 
 
-def _seed(seed: int, stage: int) -> int:
-    """The seed of a stage: stages draw by themselves."""
-    return int(np.random.SeedSequence((seed, stage)).generate_state(1)[0]) if stage else seed
+def _seed(seed: int, stage: int, attempt: int) -> int:
+    """The seed of an attempt at a stage: each draws by itself."""
+    return int(np.random.SeedSequence((seed, stage, attempt)).generate_state(1)[0])
 
 
 def _chained(plans: list[Actions], idle: int) -> Actions:
