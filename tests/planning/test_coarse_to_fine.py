@@ -243,7 +243,7 @@ def test_what_does_not_fit_together_is_refused():
 
 
 def test_refinements_by_default_are_rounds_on_each_body():
-    assert [len(each.deviations) for each in made().refinements] == [4, 2]
+    assert [len(each.deviations) for each in made().refinements] == [8, 2]
     assert CoarseToFinePlanner(small_task(9), small_task(5)).refinements == (LocalSearch(),)
 
 
