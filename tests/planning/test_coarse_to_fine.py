@@ -160,7 +160,7 @@ def test_each_body_has_noise_of_its_own(monkeypatch):
     planned()
     # The first row of the first round is the start, the second is noise around it.
     first, second = (asked[index][1] - asked[index][0] for index in (0, 2))
-    assert np.all(np.abs(first - second) > 1e-6)
+    assert np.median(np.abs(first - second)) > 1e-3  # noise at a limit is cut off
 
 
 def test_counts_and_seconds_add_up():
