@@ -147,21 +147,20 @@ def test_each_body_starts_from_the_plan_before_and_the_last_is_no_worse():
     assert execute(episode, plan.actions).score >= execute(episode, carried).score - 1e-5
 
 
-def test_each_body_has_noise_of_its_own():
-    # One round of one plan beside the start: what is drawn is the difference of the two.
-    asked, planner = [], made(refinements=(LocalSearch((0.1,), 2),) * 2)
-    for each in planner.planners[1:]:
-        told = each._told
+def test_each_body_has_noise_of_its_own(monkeypatch):
+    asked = []
+    for each in planner().planners[1:]:
 
-        def watched(episode, wants, actions, size, told=told):
+        def watched(episode, wants, actions, size, told=each._told):
             if wants == "settled":
                 asked.append(np.asarray(actions.displacement))
             return told(episode, wants, actions, size)
 
-        each._told = watched
-    planner.plan(small_task(17).episode_fn(3), CANDIDATES, SEARCH, 3)
-    first, second = (moves[1] - moves[0] for moves in asked)
-    assert np.all(np.abs(first - second) > 1e-6)
+        monkeypatch.setattr(each, "_told", watched)
+    planned()
+    # The first row of the first round is the start, the second is noise around it.
+    first, second = (asked[index][1] - asked[index][0] for index in (0, 2))
+    assert np.median(np.abs(first - second)) > 1e-3  # noise at a limit is cut off
 
 
 def test_counts_and_seconds_add_up():
@@ -199,10 +198,10 @@ def test_all_is_compiled_before_the_first_plan(monkeypatch):
 
 def test_of_candidates_with_one_coarse_particle_the_nearest_is_kept():
     # 0 to 16 on a rope of 17; one of 5 has particles beside 0, 4, 8, 12, 16.
-    coarse, middle, fine = planner()._ids(np.array([15, 7, 8, 0, 9, 14, 6]))
-    np.testing.assert_array_equal(fine, [0, 8, 15])
-    np.testing.assert_array_equal(coarse, [0, 2, 4])
-    assert middle[:2].tolist() == [0, 4]
+    coarse, middle, fine = planner()._ids(np.array([15, 7, 8, 0, 9, 3, 1]))
+    np.testing.assert_array_equal(fine, [0, 3, 8, 15])
+    np.testing.assert_array_equal(coarse, [0, 1, 2, 4])
+    assert middle[[0, 2]].tolist() == [0, 4]
     everywhere = planner()._ids(np.ones(17, bool))
     np.testing.assert_array_equal(everywhere[0], np.arange(5))
     np.testing.assert_array_equal(everywhere[2], [0, 4, 8, 12, 16])
@@ -243,7 +242,7 @@ def test_what_does_not_fit_together_is_refused():
 
 
 def test_refinements_by_default_are_rounds_on_each_body():
-    assert [len(each.deviations) for each in made().refinements] == [4, 2]
+    assert [len(each.deviations) for each in made().refinements] == [6, 2]
     assert CoarseToFinePlanner(small_task(9), small_task(5)).refinements == (LocalSearch(),)
 
 
