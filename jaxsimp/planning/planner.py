@@ -200,7 +200,8 @@ class Planner:
         ]
         num_initial = _common_number(starts)
         compile_seconds = sum(self.prepare(algorithm, space, num_initial) for space in spaces)
-        bill = _Bill(self._evaluations, checked, _largest_population(algorithm) or 1)
+        population = _largest_population(algorithm) or max(1, num_initial)
+        bill = _Bill(self._evaluations, checked, population)
         begun = time.perf_counter()
         searches = [
             questions(algorithm, space, key, on_ask, start)

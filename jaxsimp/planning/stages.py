@@ -37,7 +37,7 @@ MOVED = 0.1
 """Least distance between a stage's start and its sub-goal, in sizes of the body, for a particle to
 be a candidate that does not belong to the panels turned over."""
 ATTEMPTS = 2
-"""Number of searches for each stage, of which the one that settles best is kept: what a stage leaves
+"""Number of searches for each stage, of which the one that settles best is kept: what a stage does
 wrong, no later one cures."""
 SAME = 1e-3
 """Largest misfit of two goals that are one goal laid elsewhere, in sizes of the body."""

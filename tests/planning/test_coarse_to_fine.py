@@ -151,12 +151,13 @@ def test_each_body_has_noise_of_its_own(monkeypatch):
     asked = []
     for each in planner().planners[1:]:
 
-        def watched(episode, wants, actions, size, told=each._told):
+        def watched(wants, episodes, plans, size, told=each._evaluations):
             if wants == "settled":
-                asked.append(np.asarray(actions.displacement))
-            return told(episode, wants, actions, size)
+                asked.append(np.asarray(plans[0].displacement))
+            return told(wants, episodes, plans, size)
 
-        monkeypatch.setattr(each, "_told", watched)
+        watched.prepare = each._evaluations.prepare
+        monkeypatch.setattr(each, "_evaluations", watched)
     planned()
     # The first row of the first round is the start, the second is noise around it.
     first, second = (asked[index][1] - asked[index][0] for index in (0, 2))

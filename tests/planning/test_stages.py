@@ -97,9 +97,7 @@ def test_sub_goals_are_carried_to_the_goal_of_the_episode():
         np.testing.assert_allclose(found, each.positions, atol=1e-5)  # rounding of the goal
     # Another goal of as many folds has its own; of another number it is refused.
     letter = np.asarray(make_task("cloth_letter_fold", 9).goal)
-    for found, each in zip(
-        planner()._ends(letter), subgoals(task().body, letter), strict=True
-    ):
+    for found, each in zip(planner()._ends(letter), subgoals(task().body, letter), strict=True):
         np.testing.assert_array_equal(found, each.positions)
     corners = make_task("cloth_four_corners", 9).goal
     with pytest.raises(ValueError, match=r"has 4 folds and that of the task 2; make a planner"):
