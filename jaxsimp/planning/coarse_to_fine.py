@@ -1,9 +1,10 @@
 """Coarse to fine: search for a plan on a coarse body, refine it on a fine one.
 
-The time of a rollout is in proportion to the particles of a cloth and to the root of their number,
-as finer cloths need shorter time steps. What to grasp and about where to move it does not depend on
-the resolution. So the many rollouts of a search run on a coarse body of the same extent, and the
-few of a local search, with self-contact, on the fine one.
+A fine body has more particles and needs shorter time steps: an action of a cloth of 100 x 100 takes
+1,228 steps, of 50 x 50 363 and of 25 x 25 128, and eight executions with self-contact on two cores
+14 s, 1 s and 0.1 s. What to grasp and about where to move it depends little on the resolution. So the
+many rollouts of a search run on a coarse body of the same extent, and the few of a local search, with
+self-contact, on finer ones.
 """
 
 from collections.abc import Callable
@@ -33,6 +34,25 @@ LAST_REFINEMENT = LocalSearch((0.06, 0.04))
 """Refinement on the finest body, after others."""
 
 
+<<<<<<< HEAD
+=======
+@dataclass(frozen=True, eq=False)
+class RefinedPlan(Plan):
+    """A plan that was searched for on a coarse body and refined on finer ones.
+
+    `actions` and `optimum` are of the finest body; `num_rollouts`, `price`, `seconds` and
+    `compile_seconds` are sums over all bodies. A rollout counts the same on each, though one of a
+    cloth of 100 x 100 takes some hundred times as long as one of 25 x 25: compare prices between
+    plans of the same resolutions only, and seconds otherwise.
+
+    Attributes:
+        parts: the plan of each body, the coarsest first, and the record of its search.
+    """
+
+    parts: tuple[Plan, ...]
+
+
+>>>>>>> fine
 class CoarseToFinePlanner:
     """Planner of a task with a fine body, with the functions of `Planner`.
 
@@ -59,10 +79,10 @@ class CoarseToFinePlanner:
         Args:
             task: the task.
             coarser: the same task with a coarser body of the same extent, or with several, the
-                coarsest first; as `make_task(task.name, 25)`. Of plans around one of a cloth of
-                25 x 25, the settled scores at 50 x 50 rank as those at 100 x 100 (correlation
-                0.93), those at 25 x 25 do not (0.15); eight take 1 s at 50 x 50 and 14 s at
-                100 x 100, on two cores.
+                coarsest first; as `make_task(task.name, 25)`.
+                A body between helps: of 16 plans around one of a cloth of 25 x 25, settled scores
+                at 50 x 50 rank as those at 100 x 100 (Spearman 0.93), those at 25 x 25 hardly
+                (0.15).
             engine: engine that gives the costs of plans, see `Planner`.
             evaluator: engine that carries out the plan found, see `Planner`; the refinements by
                 default need one in JAX.
