@@ -2,9 +2,9 @@
 
 A fine body has more particles and needs shorter time steps: an action of a cloth of 100 x 100 takes
 1,228 steps, of 50 x 50 363 and of 25 x 25 128, and eight executions with self-contact on two cores
-14 s, 1 s and 0.1 s. What to grasp and about where to move it depends little on the resolution. So the
-many rollouts of a search run on a coarse body of the same extent, and the few of a local search, with
-self-contact, on finer ones.
+14 s, 1 s and 0.1 s. What to grasp and about where to move it depends little on the resolution. So
+the many rollouts of a search run on a coarse body of the same extent, and the few of a local
+search, with self-contact, on finer ones.
 """
 
 from collections.abc import Callable
@@ -34,25 +34,6 @@ LAST_REFINEMENT = LocalSearch((0.06, 0.04))
 """Refinement on the finest body, after others."""
 
 
-<<<<<<< HEAD
-=======
-@dataclass(frozen=True, eq=False)
-class RefinedPlan(Plan):
-    """A plan that was searched for on a coarse body and refined on finer ones.
-
-    `actions` and `optimum` are of the finest body; `num_rollouts`, `price`, `seconds` and
-    `compile_seconds` are sums over all bodies. A rollout counts the same on each, though one of a
-    cloth of 100 x 100 takes some hundred times as long as one of 25 x 25: compare prices between
-    plans of the same resolutions only, and seconds otherwise.
-
-    Attributes:
-        parts: the plan of each body, the coarsest first, and the record of its search.
-    """
-
-    parts: tuple[Plan, ...]
-
-
->>>>>>> fine
 class CoarseToFinePlanner:
     """Planner of a task with a fine body, with the functions of `Planner`.
 

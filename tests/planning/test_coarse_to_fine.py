@@ -23,8 +23,8 @@ from jaxsimp.planning import (
     problem,
 )
 from jaxsimp.planning.between_bodies import carried_positions, nearest_particles
-from jaxsimp.planning.evaluations import Evaluations
 from jaxsimp.planning.coarse_to_fine import best_distinct
+from jaxsimp.planning.evaluations import Evaluations
 from jaxsimp.records import load_plan, save_plan
 from jaxsimp.tasks import Task, make_task, score
 
@@ -122,11 +122,7 @@ def made(**options) -> CoarseToFinePlanner:
     return CoarseToFinePlanner(small_task(17), coarser, **options)
 
 
-<<<<<<< HEAD
-def planned(seed: int = 3, **options) -> Plan:
-=======
-def planned(seed: int = 6, **options) -> RefinedPlan:
->>>>>>> fine
+def planned(seed: int = 6, **options) -> Plan:
     return planner().plan(small_task(17).episode_fn(seed), CANDIDATES, SEARCH, seed, **options)
 
 
