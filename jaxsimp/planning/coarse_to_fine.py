@@ -2,9 +2,9 @@
 
 A fine body has more particles and needs shorter time steps: an action of a cloth of 100 x 100 takes
 1,228 steps, of 50 x 50 363 and of 25 x 25 128, and eight executions with self-contact on two cores
-14 s, 1 s and 0.1 s. What to grasp and about where to move it depends little on the resolution. So the
-many rollouts of a search run on a coarse body of the same extent, and the few of a local search, with
-self-contact, on finer ones.
+14 s, 1 s and 0.1 s. What to grasp and about where to move it depends little on the resolution. So
+the many rollouts of a search run on a coarse body of the same extent, and the few of a local
+search, with self-contact, on finer ones.
 """
 
 from collections.abc import Callable
