@@ -19,7 +19,13 @@ from experiments.planners import (
 )
 from jaxsimp.checks import require_count, require_seed
 from jaxsimp.engines import MassSprings, SearchEngine, Spread, make_ensemble
-from jaxsimp.planning import ENCODINGS, Planner, StagedPlanner, staged_task
+from jaxsimp.planning import (
+    ENCODINGS,
+    CoarseToFinePlanner,
+    Planner,
+    StagedPlanner,
+    staged_task,
+)
 from jaxsimp.simplification import METHODS
 from jaxsimp.tasks import Task, make_task, task_names
 
@@ -28,6 +34,8 @@ PLANNING = ("nominal", "robust", "self_contact", "mixed")
 """Physics of a search: the body's own, an ensemble, self-contact, or self-contact only for cloths,
 whose folds have layers."""
 ENSEMBLE_SIZE = 4
+COARSER = (25, 50)
+"""Resolutions of cloths on which plans for finer ones are searched for and refined."""
 
 
 class Run(NamedTuple):
@@ -50,6 +58,8 @@ class Run(NamedTuple):
 
 IDENTITY = Run._fields
 """Fields of a row that identify a run."""
+
+AnyPlanner = Planner | StagedPlanner | CoarseToFinePlanner
 
 
 @dataclass(frozen=True)
@@ -124,11 +134,18 @@ class PlanStudy:
         """Whether a planner plans for a task in stages."""
         return self.named(planner).in_stages and num_folds(task) > 1 and self.num_actions is None
 
-    def planner(self, name: str, planner: str) -> Planner | StagedPlanner:
+    def planner(self, name: str, planner: str) -> AnyPlanner:
         """A planner of a task, by their names."""
         task = self.task(name, planner)
-        kind = StagedPlanner if self.in_stages(task, planner) else Planner
-        return kind(task, self.engine(task), self.evaluator())
+        engines = self.engine(task), self.evaluator()
+        if self.in_stages(task, planner):
+            return StagedPlanner(task, *engines)
+        if self.named(planner).refines and is_fine(task):
+            coarser = (dataclasses.replace(self, resolution=each) for each in COARSER)
+            return CoarseToFinePlanner(
+                task, tuple(each.task(name, planner) for each in coarser), *engines
+            )
+        return Planner(task, *engines)
 
     def search(self, task: Task, planner: str) -> Search:
         """The search of a planner for plans of a task."""
@@ -172,6 +189,11 @@ class PlanStudy:
             self.tasks, self.planners, self.action_spaces, self.pick_encodings, seeds
         )
         return list(itertools.starmap(Run, combined))
+
+
+def is_fine(task: Task) -> bool:
+    """Whether a task is of a cloth so fine that its plans are searched for on coarser ones."""
+    return len(task.body.shape) == 2 and min(task.body.shape) > 1.5 * max(COARSER)
 
 
 def _require_known(kind: str, names: tuple[str, ...], known: tuple[str, ...]) -> None:

@@ -34,6 +34,7 @@ class NamedPlanner:
     Attributes:
         search: the search for plans of a task, or of each stage.
         in_stages: whether goals of several folds are planned in stages.
+        refines: whether plans of fine cloths are searched for on coarser ones, and refined.
         num_actions: number of actions in a plan, instead of the task's.
         limit: largest displacement along each axis, metres, instead of the task's.
         running_weight: weight of the running costs, instead of the task's.
@@ -41,6 +42,7 @@ class NamedPlanner:
 
     search: Callable[[Task], Search]
     in_stages: bool = False
+    refines: bool = False
     num_actions: int | None = None
     limit: float | None = None
     running_weight: float | None = None
@@ -118,7 +120,7 @@ def _num_folds(name: str, resolution: int) -> int:
 
 
 PLANNERS = {
-    "default": NamedPlanner(_default, in_stages=True),
+    "default": NamedPlanner(_default, in_stages=True, refines=True),
     # Goals of several folds by one search.
     "one_piece": NamedPlanner(_one_piece),
     # The default without one of its parts, at its price.

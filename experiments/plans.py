@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from experiments.plan_study import IDENTITY, PlanStudy, Run
+from experiments.plan_study import IDENTITY, AnyPlanner, PlanStudy, Run
 from experiments.planners import Search, counted_rollouts, num_asks, settings, with_encoding
 from experiments.progress import progress_bar
 from experiments.study import teller
 from jaxsimp import goals, records
 from jaxsimp.engines import Execution, goal_scores
-from jaxsimp.planning import ENCODINGS, Planner, StagedPlanner
+from jaxsimp.planning import ENCODINGS, CoarseToFinePlanner, Plan, StagedPlanner
 from jaxsimp.planning.algorithm import stages
 from jaxsimp.simplification import KeyPoints, simplify
 from jaxsimp.tasks import Task
@@ -163,10 +163,9 @@ def _run_all(
     with progress_bar(console) as progress:
         for pair, runs in left.items():
             planner, compile_seconds = planners[pair], compiled[pair]
-            search, searches = study.search(planner.task, pair[1]), num_searches(planner)
-            bar = progress.add_task(
-                _told(study, *pair), total=len(runs) * num_asks(search) * searches
-            )
+            search = study.search(planner.task, pair[1])
+            total = len(runs) * num_questions(planner, search)
+            bar = progress.add_task(_told(study, *pair), total=total)
             for run in runs:
                 advance = partial(progress.advance, bar)
                 row = _run(planner, search, models[run.task], run, folder, environment, advance)
@@ -183,7 +182,7 @@ def _told(study: PlanStudy, task: str, planner: str) -> str:
 
 
 def _run(
-    planner: Planner | StagedPlanner,
+    planner: AnyPlanner,
     search: Search,
     model: KeyPoints,
     run: Run,
@@ -209,7 +208,7 @@ def _run(
         found={"algorithm": repr(search), "seed": run.seed},
         provenance=environment,
     )
-    searches = plan.parts or (plan,)
+    searches = _searches(planner, plan)
     costs = np.concatenate([each.optimum.best_costs for each in searches])
     own = np.array(counted_rollouts(search))
     counted = np.concatenate([own + index * own[-1] for index in range(len(searches))])
@@ -244,7 +243,7 @@ def _same_folds(task: Task, execution: Execution) -> bool | None:
     return goals.same_folds(task.body, task.goal, end) if wanted else None
 
 
-def _row_config(planner: Planner | StagedPlanner, search: Search) -> dict[str, Any]:
+def _row_config(planner: AnyPlanner, search: Search) -> dict[str, Any]:
     task = planner.task
     return {
         "search": settings(search),
@@ -259,9 +258,16 @@ def _row_config(planner: Planner | StagedPlanner, search: Search) -> dict[str, A
     }
 
 
-def num_searches(planner: Planner | StagedPlanner) -> int:
-    """Number of searches for one plan."""
-    return planner.num_searches if isinstance(planner, StagedPlanner) else 1
+def _searches(planner: AnyPlanner, plan: Plan) -> tuple[Plan, ...]:
+    """The searches of a plan by the algorithm of its row: of a fine body, that on the coarsest."""
+    return plan.parts[:1] if isinstance(planner, CoarseToFinePlanner) else plan.parts or (plan,)
+
+
+def num_questions(planner: AnyPlanner, search: Search) -> int:
+    """Number of questions of all searches for one plan."""
+    if isinstance(planner, CoarseToFinePlanner):
+        return num_asks(search) + sum(map(num_asks, planner.refinements))
+    return num_asks(search) * (planner.num_searches if isinstance(planner, StagedPlanner) else 1)
 
 
 def finite(value: float) -> float | None:

@@ -21,7 +21,7 @@ from experiments.plan_study import ACTION_SPACES, IDENTITY
 from experiments.planners import PLANNERS, counted_rollouts, with_encoding
 from experiments.simplification import SimplificationOptions
 from jaxsimp import records
-from jaxsimp.planning import CEM, ENCODINGS
+from jaxsimp.planning import CEM, ENCODINGS, Planner, StagedPlanner
 from jaxsimp.records import load_plan
 from jaxsimp.tasks import make_task, score
 
@@ -484,3 +484,21 @@ def test_a_smoke_run_is_small():
     assert study.seeds == 2
     assert study.task("cloth_side_folding").body.num_particles == 81
     assert PaperOptions(smoke=True).folder() != PaperOptions().folder()
+
+
+def test_goals_of_several_folds_are_planned_in_stages_and_fine_cloths_from_coarse_ones():
+    study = GoalsOptions(tasks=("cloth_quarter_fold",), resolution=9).configuration()
+    made = study.planner("cloth_quarter_fold", "default")
+    assert isinstance(made, StagedPlanner)
+    assert study.task("cloth_quarter_fold").num_actions == made.task.num_actions == 2 + 4 + 2
+    one = GoalsOptions(tasks=("cloth_quarter_fold",), planners=("one_piece",), resolution=9)
+    assert type(one.configuration().planner("cloth_quarter_fold", "one_piece")) is Planner
+    assert one.configuration().task("cloth_quarter_fold").num_actions == 6
+
+    fine = PaperOptions(tasks=("cloth_side_folding",), resolution=90).configuration()
+    planners = fine.planner("cloth_side_folding", "default").planners
+    assert [planner.task.body.shape[0] for planner in planners] == [25, 50, 90]
+    # Not those of other planners, nor of ropes.
+    assert type(fine.planner("cloth_side_folding", "cem")) is Planner
+    rope = PaperOptions(tasks=("rope_folding",), resolution=90).configuration()
+    assert type(rope.planner("rope_folding", "default")) is Planner
