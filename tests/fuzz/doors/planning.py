@@ -303,6 +303,21 @@ DOORS = (
         weight=5,
     ),
     Door(
+        "planning.LocalSearch",
+        js.LocalSearch,
+        {
+            "num_plans": count(8, 30),
+            "num_starts": count(1, 8),
+            "wants": choice("settled", "cost"),
+        },
+        lambda num_plans=8, num_starts=1, wants="settled": both(
+            is_count(num_plans, 1, 10**4),
+            is_count(num_starts, 1, 10**4),
+            is_one_of(wants, ("settled", "cost")),
+            None if is_count(num_starts, 2, 10**4) is not False else True,
+        ),
+    ),
+    Door(
         "planning.Joint",
         js.Joint,
         {"borrowed": number(0.1, 5.0), "fresh": number(0.0, 1.0)},
