@@ -39,7 +39,7 @@ FIELDS = (
 """Fields that reports and replays read."""
 PLANS_FOLDER = "plans"
 MOST_UNFOLDED = 2500
-"""Most particles of a body whose end is unfolded: of 8,100 that takes minutes if the end is wrong."""
+"""Most particles of a body whose end is unfolded: of 8,100, a wrong end takes minutes."""
 
 Tasks = dict[tuple[str, str], Task]
 """Tasks by their name and that of the planner, which may change them."""
