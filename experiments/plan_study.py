@@ -13,7 +13,7 @@ from experiments.planners import (
     NamedPlanner,
     Search,
     cem_of,
-    num_folds,
+    num_stages,
     settings,
     with_cem,
 )
@@ -128,11 +128,11 @@ class PlanStudy:
         planner = planner or self.planners[0]
         task = make_task(name, self.resolution, quick=self.quick)
         changed = self.named(planner).task(task, self.num_actions)
-        return staged_task(changed, num_folds(task)) if self.in_stages(task, planner) else changed
+        return staged_task(changed, num_stages(task)) if self.in_stages(task, planner) else changed
 
     def in_stages(self, task: Task, planner: str) -> bool:
         """Whether a planner plans for a task in stages."""
-        return self.named(planner).in_stages and num_folds(task) > 1 and self.num_actions is None
+        return self.named(planner).in_stages and num_stages(task) > 0 and self.num_actions is None
 
     def planner(self, name: str, planner: str) -> AnyPlanner:
         """A planner of a task, by their names."""

@@ -20,6 +20,7 @@ from jaxsimp.planning import (
     Sequence,
     default_algorithm,
     stage_algorithm,
+    stages_of,
 )
 from jaxsimp.planning.algorithm import stages
 from jaxsimp.tasks import Task, make_task
@@ -97,7 +98,7 @@ def _smoke(task: Task) -> Sequence:
 
 
 def _default(task: Task) -> Sequence:
-    return stage_algorithm() if num_folds(task) > 1 else default_algorithm(task)
+    return stage_algorithm() if num_stages(task) else default_algorithm(task)
 
 
 def _one_piece(task: Task) -> CEM:
@@ -105,18 +106,19 @@ def _one_piece(task: Task) -> CEM:
     return CEM(num_iterations=40, smoothing=0.2, encoding=Joint())
 
 
-def num_folds(task: Task) -> int:
-    """Number of folds of a task's goal; 0 if it has none, or none are found."""
-    return _num_folds(task.name, task.resolution) if len(task.body.faces) else 0
+def num_stages(task: Task) -> int:
+    """Number of stages of plans for a task's goal if it has several folds; 0 otherwise."""
+    return _num_stages(task.name, task.resolution) if len(task.body.faces) else 0
 
 
 @cache
-def _num_folds(name: str, resolution: int) -> int:
+def _num_stages(name: str, resolution: int) -> int:
     task = make_task(name, resolution)
     try:
-        return len(find_folds(task.body, task.goal))
+        has_several = len(find_folds(task.body, task.goal)) > 1
     except ValueError:
         return 0
+    return len(stages_of(task, task.goal)) if has_several else 0
 
 
 PLANNERS = {

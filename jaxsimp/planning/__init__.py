@@ -20,7 +20,7 @@ from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_sp
 from jaxsimp.planning.random_shooting import RandomShooting
 from jaxsimp.planning.reranking import Reranking
 from jaxsimp.planning.space import ActionSpace, Plans
-from jaxsimp.planning.stages import StagedPlanner, stage_algorithm, staged_task
+from jaxsimp.planning.stages import StagedPlanner, stage_algorithm, staged_task, stages_of
 
 __all__ = [
     "CEM",
@@ -59,4 +59,5 @@ __all__ = [
     "search_on_host",
     "stage_algorithm",
     "staged_task",
+    "stages_of",
 ]

@@ -59,20 +59,46 @@ def stage_algorithm(*, reranks: bool = True) -> Sequence:
     return Sequence((*parts, last) if reranks else parts)
 
 
-def staged_task(task: Task, num_folds: int) -> Task:
-    """The task with as many actions as plans in stages have: those of each fold, and idle ones."""
-    idle = (num_folds - 1) * task.settle_actions
-    return dataclasses.replace(task, num_actions=num_folds * STAGE_ACTIONS + idle)
+def stages_of(task: Task, goal: Positions) -> tuple[Subgoal, ...]:
+    """The sub-goals of a goal, of which folds side by side are one: as many as there are pickers.
+
+    Raises:
+        ValueError: if `jaxsimp.goals.find_folds` refuses the goal.
+    """
+    found: list[tuple[Subgoal, int]] = []
+    for each in subgoals(task.body, goal):
+        last, count = found[-1] if found else (each, task.num_pickers)
+        if count < task.num_pickers and _are_side_by_side(last, each, task.body.radius):
+            found[-1] = dataclasses.replace(each, moving=last.moving | each.moving), count + 1
+        else:
+            found.append((each, 1))
+    return tuple(each for each, _ in found)
+
+
+def _are_side_by_side(first: Subgoal, second: Subgoal, radius: float) -> bool:
+    """Whether neither of two folds moves or covers what the other moves."""
+    if np.any(first.moving & second.moving):
+        return False
+    height = np.asarray(second.positions)[:, 2]
+    layers = [np.median(height[each.moving]) for each in (first, second)]
+    return bool(abs(layers[1] - layers[0]) < radius)
+
+
+def staged_task(task: Task, num_stages: int) -> Task:
+    """The task with as many actions as plans in stages have: those of each stage, and idle ones."""
+    idle = (num_stages - 1) * task.settle_actions
+    return dataclasses.replace(task, num_actions=num_stages * STAGE_ACTIONS + idle)
 
 
 class StagedPlanner:
     """Planner of a task whose goal has folds, with the functions of `Planner`.
 
-    A plan has `STAGE_ACTIONS` actions for each fold, and between folds as many idle ones as the
-    task's body settles for; it is carried out and saved as any other.
+    A stage is a fold, or several side by side. A plan has `STAGE_ACTIONS` actions for each, and
+    between stages as many idle ones as the task's body settles for; it is carried out and saved as
+    any other.
 
     Attributes:
-        subgoals: the sub-goals of the task's goal.
+        subgoals: the sub-goals of the stages, the last being the task's goal.
     """
 
     def __init__(
@@ -94,7 +120,7 @@ class StagedPlanner:
             ValueError: if `jaxsimp.goals.find_folds` refuses the goal, the goal has no folds, or
                 `Planner` raises.
         """
-        self.subgoals = subgoals(task.body, task.goal)
+        self.subgoals = stages_of(task, task.goal)
         if not self.subgoals:
             raise ValueError(
                 f"the goal of {task.name} has no folds; plan for it in one piece, with Planner"
@@ -153,7 +179,7 @@ class StagedPlanner:
 
         Raises:
             ValueError: as `Planner.plan`; or if the goal of the episode is not that of the task,
-                and `jaxsimp.goals.find_folds` refuses it or finds another number of folds.
+                and `jaxsimp.goals.find_folds` refuses it or it takes another number of stages.
         """
         body = self.task.body
         episode = as_float(require_episode(episode, body.num_particles))
@@ -191,7 +217,7 @@ class StagedPlanner:
         turn, shift, mirrored = fit_isometry(own, wanted)
         misfit = np.abs(turn * own + shift - wanted), np.abs(self._goal - goal)[:, 2]
         if mirrored or np.max(misfit) > SAME * self.task.body.size:
-            return self._ends_of(subgoals(self.task.body, goal))
+            return self._ends_of(stages_of(self.task, goal))
         ends = [np.array(each.positions, float) for each in self.subgoals]
         for end in ends:
             place = turn * (end[:, 0] + 1j * end[:, 1]) + shift
@@ -201,7 +227,7 @@ class StagedPlanner:
     def _ends_of(self, found: tuple[Subgoal, ...]) -> list[Positions]:
         if len(found) != len(self.subgoals):
             raise ValueError(
-                f"the goal of the episode has {len(found)} folds and that of the task "
+                f"the goal of the episode takes {len(found)} stages and that of the task "
                 f"{len(self.subgoals)}; make a planner of a task with this goal"
             )
         return [np.asarray(each.positions, float) for each in found]

@@ -99,9 +99,27 @@ def test_sub_goals_are_carried_to_the_goal_of_the_episode():
     letter = np.asarray(make_task("cloth_letter_fold", 9).goal)
     for found, each in zip(planner()._ends(letter), subgoals(task().body, letter), strict=True):
         np.testing.assert_array_equal(found, each.positions)
-    corners = make_task("cloth_four_corners", 9).goal
-    with pytest.raises(ValueError, match=r"has 4 folds and that of the task 2; make a planner"):
-        planner().plan(Episode(task().episode_fn(0).start, corners), CORNERS, SEARCH)
+    side = np.asarray(make_task("cloth_side_folding", 9).goal)
+    with pytest.raises(ValueError, match=r"takes 1 stages and that of the task 2; make a planner"):
+        planner().plan(Episode(task().episode_fn(0).start, side), CORNERS, SEARCH)
+
+
+def test_folds_side_by_side_are_one_stage_for_two_pickers():
+    corners = make_task("cloth_four_corners", 9)
+    folds = subgoals(corners.body, corners.goal)
+    found = stages.stages_of(corners, corners.goal)
+    assert (len(folds), len(found)) == (4, 2)
+    for index, each in enumerate(found):
+        np.testing.assert_array_equal(
+            each.moving, folds[2 * index].moving | folds[2 * index + 1].moving
+        )
+        np.testing.assert_array_equal(each.positions, folds[2 * index + 1].positions)
+    one_picker = dataclasses.replace(corners, num_pickers=1)
+    assert len(stages.stages_of(one_picker, corners.goal)) == 4
+    # The third of a letter that comes second lies on the first, which it does not move.
+    letter = make_task("cloth_letter_fold", 9)
+    first, second = stages.stages_of(letter, letter.goal)
+    assert not np.any(first.moving & second.moving)
 
 
 def test_candidates_of_a_stage_are_those_that_it_moves():
