@@ -190,10 +190,9 @@ class StagedPlanner:
         parts: list[Plan] = []
         chain: list[Actions] = []
         start = episode.start
-        ends = self._ends(np.asarray(episode.goal, float))
-        for index, (each, end) in enumerate(zip(self.subgoals, ends, strict=True)):
-            stage = Episode(start, end)
-            own = _candidates(ids, each.moving, start, end, MOVED * body.size)
+        for index, each in enumerate(self._subgoals(np.asarray(episode.goal, float))):
+            stage = Episode(start, each.positions)
+            own = _candidates(ids, each.moving, start, each.positions, MOVED * body.size)
             seeds = [_seed(seed, index, attempt) for attempt in range(ATTEMPTS)]
             found = self._stage.plan_batch(
                 [stage] * ATTEMPTS, [own] * ATTEMPTS, algorithm, seeds, on_ask
@@ -211,26 +210,27 @@ class StagedPlanner:
             price=len(parts) * PRICES["settled"],
         )
 
-    def _ends(self, goal: Positions) -> list[Positions]:
-        """Positions of the sub-goals where the goal of an episode lies."""
+    def _subgoals(self, goal: Positions) -> tuple[Subgoal, ...]:
+        """The sub-goals where the goal of an episode lies."""
         own, wanted = (p[:, 0] + 1j * p[:, 1] for p in (self._goal, goal))
         turn, shift, mirrored = fit_isometry(own, wanted)
         misfit = np.abs(turn * own + shift - wanted), np.abs(self._goal - goal)[:, 2]
         if mirrored or np.max(misfit) > SAME * self.task.body.size:
-            return self._ends_of(stages_of(self.task, goal))
+            return self._subgoals_of(goal)
         ends = [np.array(each.positions, float) for each in self.subgoals]
         for end in ends:
             place = turn * (end[:, 0] + 1j * end[:, 1]) + shift
             end[:, 0], end[:, 1] = place.real, place.imag
-        return ends
+        return tuple(map(_with_positions, self.subgoals, ends))
 
-    def _ends_of(self, found: tuple[Subgoal, ...]) -> list[Positions]:
+    def _subgoals_of(self, goal: Positions) -> tuple[Subgoal, ...]:
+        found = stages_of(self.task, goal)
         if len(found) != len(self.subgoals):
             raise ValueError(
                 f"the goal of the episode takes {len(found)} stages and that of the task "
                 f"{len(self.subgoals)}; make a planner of a task with this goal"
             )
-        return [np.asarray(each.positions, float) for each in found]
+        return found
 
     def prepare(self, algorithm: Algorithm | Sequence, space: ActionSpace | None = None) -> float:
         """Compile the functions of a stage, see `Planner.prepare`."""
@@ -251,6 +251,10 @@ class StagedPlanner:
             ValueError: if the episode or the plan is not of the task.
         """
         return self._whole.execute(episode, actions)
+
+
+def _with_positions(subgoal: Subgoal, positions: Positions) -> Subgoal:
+    return dataclasses.replace(subgoal, positions=positions)
 
 
 def _candidates(

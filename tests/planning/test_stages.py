@@ -81,7 +81,9 @@ def test_a_stage_starts_where_the_last_one_left_the_body(monkeypatch):
 def test_the_better_attempt_at_a_stage_is_kept():
     plan, episode = planned(), task().episode_fn(3)
     stage, (first, second) = planner()._stage, plan.parts[:2]
-    one = Episode(np.float32(episode.start), np.float32(planner()._ends(episode.goal)[0]))
+    one = Episode(
+        np.float32(episode.start), np.float32(planner()._subgoals(episode.goal)[0].positions)
+    )
     scores = [stage.execute(one, each.actions).score for each in (first, second)]
     assert scores[0] != scores[1]
     best = (first, second)[int(np.argmax(scores))]
@@ -93,12 +95,16 @@ def test_sub_goals_are_carried_to_the_goal_of_the_episode():
     # The oracle finds the folds of the goal that is turned.
     goal = np.asarray(task().episode_fn(5).goal, float)
     wanted = subgoals(task().body, goal)
-    for found, each in zip(planner()._ends(goal), wanted, strict=True):
-        np.testing.assert_allclose(found, each.positions, atol=1e-5)  # rounding of the goal
+    for found, each in zip(planner()._subgoals(goal), wanted, strict=True):
+        # rounding of the goal
+        np.testing.assert_allclose(found.positions, each.positions, atol=1e-5)
+        np.testing.assert_array_equal(found.moving, each.moving)
     # Another goal of as many folds has its own; of another number it is refused.
     letter = np.asarray(make_task("cloth_letter_fold", 9).goal)
-    for found, each in zip(planner()._ends(letter), subgoals(task().body, letter), strict=True):
-        np.testing.assert_array_equal(found, each.positions)
+    wanted = subgoals(task().body, letter)
+    for found, each in zip(planner()._subgoals(letter), wanted, strict=True):
+        np.testing.assert_array_equal(found.positions, each.positions)
+        np.testing.assert_array_equal(found.moving, each.moving)
     side = np.asarray(make_task("cloth_side_folding", 9).goal)
     with pytest.raises(ValueError, match=r"takes 1 stages and that of the task 2; make a planner"):
         planner().plan(Episode(task().episode_fn(0).start, side), CORNERS, SEARCH)
