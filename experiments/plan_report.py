@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plan_study import IDENTITY, PlanStudy
 from experiments.plans import PLANS_FOLDER, ROWS_FILE, key_points
 from jaxsimp import records, viz
+from jaxsimp.records.markdown import provenance, save_figure, spread, success_interval, table
 
 Rows = list[dict[str, Any]]
 SUMMARY_FILE = "summary.json"

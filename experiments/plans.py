@@ -15,12 +15,13 @@ from rich.console import Console
 
 from experiments.plan_study import IDENTITY, AnyPlanner, PlanStudy, Run
 from experiments.planners import Search, counted_rollouts, num_asks, settings, with_encoding
-from experiments.progress import progress_bar
 from experiments.study import teller
 from jaxsimp import goals, records
+from jaxsimp.cli.progress import progress_bar
 from jaxsimp.engines import Execution, goal_scores
 from jaxsimp.planning import ENCODINGS, CoarseToFinePlanner, Plan, StagedPlanner
 from jaxsimp.planning.algorithm import stages
+from jaxsimp.planning.planner import ATTEMPTS
 from jaxsimp.simplification import KeyPoints, simplify
 from jaxsimp.tasks import Task
 
@@ -267,13 +268,13 @@ def _row_config(planner: AnyPlanner, search: Search) -> dict[str, Any]:
 
 def _searches(planner: AnyPlanner, plan: Plan) -> tuple[Plan, ...]:
     """The searches of a plan by the algorithm of its row: of a fine body, that on the coarsest."""
-    return plan.parts[:1] if isinstance(planner, CoarseToFinePlanner) else plan.parts or (plan,)
+    return (plan.parts[0] if isinstance(planner, CoarseToFinePlanner) else plan).searches
 
 
 def num_questions(planner: AnyPlanner, search: Search) -> int:
     """Number of questions of all searches for one plan."""
     if isinstance(planner, CoarseToFinePlanner):
-        return num_asks(search) + sum(map(num_asks, planner.refinements))
+        return ATTEMPTS * num_asks(search) + sum(map(num_asks, planner.refinements))
     return num_asks(search) * (planner.num_searches if isinstance(planner, StagedPlanner) else 1)
 
 

@@ -25,12 +25,12 @@ from experiments.ideal_goals import (
     ideal_line,
     is_right,
 )
-from experiments.progress import progress_bar
 from experiments.settled_goals import SETTLED_FOLDS, settled_goal
 from experiments.study import default_folder, teller
 from jaxsimp import records
 from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.checks import require_count, require_seed
+from jaxsimp.cli.progress import progress_bar
 from jaxsimp.simplification import METHODS, simplify_batch
 
 ROWS_FILE = "goals.jsonl"

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.markdown import provenance, save_figure, success_interval, table
 from experiments.simplification import ROWS_FILE, Case, SimplificationStudy
 from jaxsimp import records, viz
+from jaxsimp.records.markdown import provenance, save_figure, success_interval, table
 from jaxsimp.simplification import KeyPoints, simplify_batch
 
 if TYPE_CHECKING:

@@ -20,10 +20,10 @@ from rich.console import Console
 from experiments import plans
 from experiments.plan_options import PlanOptions
 from experiments.plan_study import IDENTITY, PlanStudy, Run
-from experiments.progress import progress_bar
 from experiments.scripted import SCRIPTS, scripted_plan
 from experiments.study import teller, told_done
 from jaxsimp import records
+from jaxsimp.cli.progress import progress_bar
 from jaxsimp.engines import Execution, MuJoCo, replay
 from jaxsimp.engines.mujoco import VARIANTS
 from jaxsimp.tasks import Task, score, task_names

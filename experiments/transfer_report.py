@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from experiments.markdown import provenance, save_figure, spread, success_interval, table
 from experiments.plans import PLANS_FOLDER
 from experiments.transfer import REPLAYS_FOLDER, ROWS_FILE, SCRIPTED, TransferStudy, replay_path
 from jaxsimp import records, viz
 from jaxsimp.engines.mujoco import VARIANTS
+from jaxsimp.records.markdown import provenance, save_figure, spread, success_interval, table
 
 Rows = list[dict[str, Any]]
 ENGINES = {

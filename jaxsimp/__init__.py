@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         calibration,
         dynamics,
         engines,
+        goal_plan,
         goals,
         planning,
         records,
@@ -91,6 +92,7 @@ if TYPE_CHECKING:
         replay,
     )
     from jaxsimp.engines.mujoco import make_model, save_mjcf
+    from jaxsimp.goal_plan import GoalPlan, GoalPlanner, goal_planner, plan
     from jaxsimp.goals import Subgoal, find_folds, same_folds, subgoals
     from jaxsimp.planning import (
         CEM,
@@ -127,7 +129,7 @@ if TYPE_CHECKING:
         simplify,
         simplify_batch,
     )
-    from jaxsimp.tasks import Episode, Task, make_task, register, score, task_names
+    from jaxsimp.tasks import Episode, Task, make_task, reach, register, score, task_names
 
     __version__: str
 
@@ -157,6 +159,8 @@ __all__ = [
     "FitStatus",
     "Garment",
     "GaussianIndex",
+    "GoalPlan",
+    "GoalPlanner",
     "GoalScores",
     "Joint",
     "KeyPoints",
@@ -200,6 +204,8 @@ __all__ = [
     "engines",
     "find_folds",
     "from_mesh",
+    "goal_plan",
+    "goal_planner",
     "goal_scores",
     "goals",
     "largest_time_step",
@@ -213,7 +219,9 @@ __all__ = [
     "make_simulation",
     "make_task",
     "optimize",
+    "plan",
     "planning",
+    "reach",
     "recording_error",
     "records",
     "register",
@@ -253,6 +261,7 @@ _ROOMS = {
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
     "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",
+    "goal_plan": "GoalPlan GoalPlanner goal_planner plan",
     "goals": "Subgoal find_folds same_folds subgoals",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical CoarseToFinePlanner Descent "
     "Encoding GaussianIndex Joint LocalSearch Optimum Plan Planner Plans RandomShooting "
@@ -260,7 +269,7 @@ _ROOMS = {
     "search_on_host",
     "records": "SavedPlan load_plan save_plan",
     "simplification": "METHODS FitStatus KeyPoints Workspace simplify simplify_batch",
-    "tasks": "Episode Task make_task register score task_names",
+    "tasks": "Episode Task make_task reach register score task_names",
     "viz": "",
 }
 """Names of the face: for each room the names that `jaxsimp` exports directly."""

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from experiments.benchmark import contact, planning, rollouts
 from experiments.benchmark.measure import FULL, QUICK, Row, Scale
-from experiments.progress import progress_bar
 from jaxsimp import records
+from jaxsimp.cli.progress import progress_bar
 from jaxsimp.cli.status import exit_status
 
 SECTIONS: dict[str, Callable[[Scale], Iterator[Row]]] = {

@@ -86,7 +86,8 @@ class Options:
                 file's.
         """
         from jaxsimp.bodies.size import LARGEST, require_scale
-        from jaxsimp.checks import require_choice, require_number, require_path
+        from jaxsimp.checks import require_choice, require_number
+        from jaxsimp.cli.paths import require_writable
         from jaxsimp.simplification.key_points import SMALLEST_TOLERANCE
 
         if not self.goals:
@@ -101,11 +102,7 @@ class Options:
         for name, path in (("--json", self.json), ("--figure", self.figure)):
             if path is None:
                 continue
-            require_path(path, f"give another {name}")
-            if path.is_dir():
-                raise ValueError(f"{path} is a folder; give a file with {name}")
-            if not path.parent.is_dir():
-                raise ValueError(f"{path.parent} is no folder; make it, or give another {name}")
+            require_writable(path, name)
             if path.resolve() in used:
                 raise ValueError(f"{path} is another file of this command; give another {name}")
             used.append(path.resolve())

@@ -96,6 +96,16 @@ def require_limits(limits: Any) -> tuple[float, float, float]:
     return x, y, z
 
 
+def top_speed(limits: tuple[float, float, float], seconds: float) -> float:
+    """Largest speed of a picker, metres per second: midway along its longest displacement.
+
+    Args:
+        limits: largest displacement along x, y, z, metres.
+        seconds: duration of the action, seconds.
+    """
+    return 1.5 * float(np.linalg.norm(limits)) / seconds
+
+
 def require_actions(actions: Any, num_particles: int, *, batch: bool = False) -> Actions:
     """A plan as arrays, or several with a first axis `B`, checked.
 

@@ -15,6 +15,7 @@ from jaxsimp.goals.folds import (
     rectangle_folds,
     sleeves_in,
 )
+from jaxsimp.goals.placement import flat_at
 from jaxsimp.goals.shapes import (
     Positions,
     crossed_triangle,
@@ -36,6 +37,7 @@ __all__ = [
     "crossed_triangle",
     "find_folds",
     "flat",
+    "flat_at",
     "fold",
     "fold_sequence",
     "leg_over_leg",

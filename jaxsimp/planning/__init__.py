@@ -20,7 +20,14 @@ from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_sp
 from jaxsimp.planning.random_shooting import RandomShooting
 from jaxsimp.planning.reranking import Reranking
 from jaxsimp.planning.space import ActionSpace, Plans
-from jaxsimp.planning.stages import StagedPlanner, stage_algorithm, staged_task, stages_of
+from jaxsimp.planning.stages import (
+    StagedPlanner,
+    num_stages,
+    planner_of,
+    stage_algorithm,
+    staged_task,
+    stages_of,
+)
 
 __all__ = [
     "CEM",
@@ -54,7 +61,9 @@ __all__ = [
     "carry_over",
     "default_algorithm",
     "make_problem",
+    "num_stages",
     "optimize",
+    "planner_of",
     "price",
     "search_on_host",
     "stage_algorithm",

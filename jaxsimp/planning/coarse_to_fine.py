@@ -19,7 +19,7 @@ from jaxsimp.engines import Engine, Execution, Layout, SearchEngine
 from jaxsimp.planning.algorithm import Algorithm, Sequence, stages
 from jaxsimp.planning.between_bodies import carried_positions, nearest_particles, renamed
 from jaxsimp.planning.local_search import LocalSearch
-from jaxsimp.planning.planner import Plan, Planner, combined
+from jaxsimp.planning.planner import ATTEMPTS, Plan, Planner, combined
 from jaxsimp.planning.problem import Candidates, action_space
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints
@@ -38,7 +38,8 @@ class CoarseToFinePlanner:
     """Planner of a task with a fine body, with the functions of `Planner`.
 
     It searches on the coarsest body, from the same start, over the particles nearest to the
-    candidates. The plan found is refined on each finer body in turn, where it picks the particles
+    candidates: `ATTEMPTS` times, since a plan that crumples a fine cloth is dear to carry out. The
+    best plan is refined on each finer body in turn, where it picks the particles
     nearest to the same candidates: on the finest, the candidates.
 
     Attributes:
@@ -136,7 +137,9 @@ class CoarseToFinePlanner:
         episode = require_episode(episode, self.task.body.num_particles)
         ids = self._ids(candidates)
         first, *finer = self.planners
-        parts = [first.plan(self._episode(first, episode), ids[0], algorithm, seed, on_ask)]
+        seeds = [_own_seed(seed, len(finer) + attempt) for attempt in range(ATTEMPTS)]
+        start = self._episode(first, episode)
+        parts = [first.plan_best(start, ids[0], algorithm, seeds, on_ask)[0]]
         for level, (planner, refinement) in enumerate(zip(finer, self.refinements, strict=True)):
             before, found = self.planners[level].task, parts[-1]
             starts = best_distinct(action_space(before, ids[level]), found, _num_starts(refinement))
@@ -146,7 +149,7 @@ class CoarseToFinePlanner:
             initial = renamed(starts, new_ids)
             own = _own_seed(seed, level)
             parts.append(planner.plan(start, ids[level + 1], refinement, own, on_ask, initial))
-        return combined(parts[-1].actions, parts)
+        return combined(parts[-1].actions, parts, parts[-1].optimum)
 
     def _episode(self, planner: Planner, episode: Episode) -> Episode:
         """The episode of a planner's body that lies where the fine one lies."""
@@ -187,9 +190,10 @@ class CoarseToFinePlanner:
     def estimate_seconds(self, algorithm: Algorithm | Sequence) -> float:
         """Estimate the time of all searches, see `Planner.estimate_seconds`."""
         searches = (algorithm, *self.refinements)
+        times = (ATTEMPTS, *[1] * len(self.refinements))
         return sum(
-            planner.estimate_seconds(search)
-            for planner, search in zip(self.planners, searches, strict=True)
+            count * planner.estimate_seconds(search)
+            for count, planner, search in zip(times, self.planners, searches, strict=True)
         )
 
     def layout_of(self, algorithm: Algorithm) -> Layout:

@@ -1,5 +1,7 @@
 """The default search: what to grasp by CEM, where to move it by gradients, which plan by score."""
 
+from math import ceil
+
 from jaxsimp.planning.algorithm import Algorithm, Sequence
 from jaxsimp.planning.cem import CEM
 from jaxsimp.planning.descent import Descent
@@ -10,11 +12,15 @@ from jaxsimp.tasks import Task
 DESCENTS_OF_ROPE = 4
 """Number of plans of a rope that descend: the best of CEM is often not the best after descent."""
 
+ROUNDS, FEW_ACTIONS = 10, 4
+"""Number of rounds of CEM for each of so many actions: longer plans have more to choose."""
+
 
 def default_algorithm(task: Task, *, reranks: bool = True) -> Sequence:
     """The default search for plans of a task.
 
-    CEM draws what all pickers grasp at once, for 10 rounds; the best of its plans descend along the
+    CEM draws what all pickers grasp at once, for 10 rounds, or more for plans of more than four
+    actions; the best of its plans descend along the
     gradient; of the 8 best distinct plans that have been seen, the one of the highest settled score
     in the evaluator's physics is returned. The price is that of 1,906 rollouts, 2,536 for ropes.
 
@@ -24,9 +30,10 @@ def default_algorithm(task: Task, *, reranks: bool = True) -> Sequence:
         task: the task.
         reranks: whether the last part is done, which needs an evaluator in JAX.
     """
+    num_iterations = ROUNDS * ceil(task.num_actions / FEW_ACTIONS)
     num_starts = 1 if len(task.body.faces) else DESCENTS_OF_ROPE
     parts: tuple[Algorithm, ...] = (
-        CEM(num_iterations=10, encoding=Joint()),
+        CEM(num_iterations=num_iterations, encoding=Joint()),
         Descent(num_starts=num_starts),
     )
     return Sequence((*parts, Reranking()) if reranks else parts)

@@ -33,6 +33,10 @@ from jaxsimp.planning.space import ActionSpace, Plans
 from jaxsimp.tasks import Episode, Task
 from jaxsimp.tasks.episode import require_episode
 
+ATTEMPTS = 2
+"""Number of searches of which the best is kept, where a plan need not be cheap: a search may settle
+on picks from which no descent leads to the goal, and seldom do two."""
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -57,19 +61,27 @@ class Plan:
     compile_seconds: float
     parts: tuple["Plan", ...] = ()
 
+    @property
+    def searches(self) -> tuple["Plan", ...]:
+        """The single searches that it was made from, in order; itself if it is one."""
+        return tuple(one for part in self.parts for one in part.searches) or (self,)
 
-def combined(actions: Actions, parts: Seq[Plan], num_rollouts: int = 0, price: int = 0) -> Plan:
-    """A plan made from those of several searches: the last one's optimum, and sums of the rest.
+
+def combined(
+    actions: Actions, parts: Seq[Plan], optimum: Optimum, num_rollouts: int = 0, price: int = 0
+) -> Plan:
+    """A plan made from those of several searches, with sums of their numbers.
 
     Args:
         actions: the plan.
         parts: the plans of the searches.
+        optimum: costs by question, as of one of the parts.
         num_rollouts: number of plans evaluated between the searches.
         price: price of these, in rollouts.
     """
     return Plan(
         actions=actions,
-        optimum=parts[-1].optimum,
+        optimum=optimum,
         num_rollouts=num_rollouts + sum(part.num_rollouts for part in parts),
         price=price + sum(part.price for part in parts),
         seconds=sum(part.seconds for part in parts),
@@ -221,6 +233,35 @@ class Planner:
             )
             for optimum in found
         )
+
+    def plan_best(
+        self,
+        episode: Episode,
+        candidates: Candidates,
+        algorithm: Algorithm | Sequence | None = None,
+        seeds: Seq[int] = tuple(range(ATTEMPTS)),
+        on_ask: Callable[[], None] = lambda: None,
+    ) -> tuple[Plan, Execution]:
+        """Search several times, side by side; the plan of the best score, and its execution.
+
+        The `parts` of the plan are the searches. Each execution counts as a settled score.
+
+        Args:
+            episode: start and goal.
+            candidates: particles that a picker may grasp.
+            algorithm: algorithm of each search, as for `plan`.
+            seeds: seed of each search.
+            on_ask: function called after each question of a search.
+
+        Raises:
+            ValueError: as `plan_batch`.
+        """
+        count = len(seeds)
+        found = self.plan_batch([episode] * count, [candidates] * count, algorithm, seeds, on_ask)
+        done = [self.execute(episode, plan.actions) for plan in found]
+        best = int(np.argmax([np.nan_to_num(one.score, nan=-np.inf) for one in done]))
+        actions, optimum = found[best].actions, found[best].optimum
+        return combined(actions, found, optimum, count, count * PRICES["settled"]), done[best]
 
     def prepare(
         self,

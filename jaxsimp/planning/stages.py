@@ -16,14 +16,14 @@ from jaxtyping import Bool, Int
 from jaxsimp.dynamics import NONE, Actions
 from jaxsimp.engines import Engine, Execution, Layout, SearchEngine
 from jaxsimp.engines.rollouts import as_float
-from jaxsimp.goals import Positions, Subgoal, subgoals
+from jaxsimp.goals import Positions, Subgoal, find_folds, subgoals
 from jaxsimp.goals.panels import fit_isometry
-from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence
+from jaxsimp.planning.algorithm import Algorithm, Sequence
 from jaxsimp.planning.cem import CEM
 from jaxsimp.planning.descent import Descent
 from jaxsimp.planning.encodings import Joint
 from jaxsimp.planning.local_search import LocalSearch
-from jaxsimp.planning.planner import Plan, Planner, combined
+from jaxsimp.planning.planner import ATTEMPTS, Plan, Planner, combined
 from jaxsimp.planning.problem import Candidates
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints
@@ -36,9 +36,6 @@ STAGE_ACTIONS = 2
 MOVED = 0.1
 """Least distance between a stage's start and its sub-goal, in sizes of the body, for a particle to
 be a candidate that does not belong to the panels turned over."""
-ATTEMPTS = 2
-"""Number of searches for each stage, of which the one that settles best is kept: what a stage does
-wrong, no later one cures."""
 SAME = 1e-3
 """Largest misfit of two goals that are one goal laid elsewhere, in sizes of the body."""
 
@@ -166,8 +163,9 @@ class StagedPlanner:
     ) -> Plan:
         """Search for a plan, stage by stage.
 
-        Its `parts` are the searches, `ATTEMPTS` for each stage, and its `optimum` is that of the
-        last one. Carrying out a stage, to know where it leaves the body, counts as a settled score.
+        Its `parts` are the stages, whose parts are the searches, `ATTEMPTS` each; its `optimum` is
+        that of the last one. Carrying out a stage, to know where it leaves the body, counts as a
+        settled score.
 
         Args:
             episode: start and goal; the goal is that of the task, laid anywhere, or another one.
@@ -187,28 +185,18 @@ class StagedPlanner:
         ids = as_candidates(given, body.num_particles)
         if algorithm is None:
             algorithm = stage_algorithm(reranks=isinstance(self.evaluator, SearchEngine))
-        parts: list[Plan] = []
-        chain: list[Actions] = []
+        stages: list[Plan] = []
         start = episode.start
         for index, each in enumerate(self._subgoals(np.asarray(episode.goal, float))):
             stage = Episode(start, each.positions)
             own = _candidates(ids, each.moving, start, each.positions, MOVED * body.size)
             seeds = [_seed(seed, index, attempt) for attempt in range(ATTEMPTS)]
-            found = self._stage.plan_batch(
-                [stage] * ATTEMPTS, [own] * ATTEMPTS, algorithm, seeds, on_ask
-            )
-            done = [self._stage.execute(stage, plan.actions) for plan in found]
-            best = int(np.argmax([np.nan_to_num(one.score, nan=-np.inf) for one in done]))
-            parts += found
-            chain.append(found[best].actions)
-            left = done[best].positions[-1]
+            found, done = self._stage.plan_best(stage, own, algorithm, seeds, on_ask)
+            stages.append(found)
+            left = done.positions[-1]
             start = left if np.isfinite(left).all() else start
-        return combined(
-            _chained(chain, self.task.settle_actions),
-            parts,
-            num_rollouts=len(parts),
-            price=len(parts) * PRICES["settled"],
-        )
+        chain = _chained([each.actions for each in stages], self.task.settle_actions)
+        return combined(chain, stages, stages[-1].optimum)
 
     def _subgoals(self, goal: Positions) -> tuple[Subgoal, ...]:
         """The sub-goals where the goal of an episode lies."""
@@ -284,3 +272,35 @@ def _chained(plans: list[Actions], idle: int) -> Actions:
         picks += [nothing[0], each.pick]
         moves += [nothing[1], each.displacement]
     return Actions(jnp.concatenate(picks), jnp.concatenate(moves))
+
+
+def num_stages(task: Task) -> int:
+    """Number of stages of a goal of several folds; 0 for any other, which is one search's work."""
+    if not len(task.body.faces):
+        return 0
+    try:
+        has_several = len(find_folds(task.body, task.goal)) > 1
+    except ValueError:  # no folds give the goal
+        return 0
+    return len(stages_of(task, task.goal)) if has_several else 0
+
+
+def planner_of(
+    task: Task,
+    engine: SearchEngine | None = None,
+    evaluator: Engine | None = None,
+    layout: Layout | None = None,
+) -> Planner | StagedPlanner:
+    """The default planner of a task: in stages for a goal of several folds, else in one piece.
+
+    Args:
+        task: the task.
+        engine: engine that gives the costs of plans, see `Planner`.
+        evaluator: engine that carries out plans, see `Planner`.
+        layout: layout of populations on this machine; by default the fastest in measurements.
+
+    Raises:
+        ValueError: if `Planner` raises.
+    """
+    kind = StagedPlanner if num_stages(task) else Planner
+    return kind(task, engine, evaluator, layout)

@@ -27,7 +27,7 @@ from jaxsimp.dynamics.pickers import checked_actions, require_actions
 from jaxsimp.engines import Execution
 from jaxsimp.records.files import whole_file
 from jaxsimp.records.provenance import environment
-from jaxsimp.tasks import Episode, FixedStart, Task, distance_cost, make_task, task_names
+from jaxsimp.tasks import COSTS, Episode, FixedStart, Task, distance_cost, make_task, task_names
 from jaxsimp.tasks.episode import require_episode
 
 SETTINGS = ("limits", "num_actions", "num_pickers", "action_seconds", "settle_actions")
@@ -76,8 +76,9 @@ class SavedPlan:
     def task(self) -> Task:
         """The task of the plan, with its body, start and goal, to replay or score it.
 
-        A registered task has its own costs; any other has the mean distance to the goal as cost,
-        since a file holds no functions.
+        A registered task has its own costs, and any other the cost in `jaxsimp.tasks.COSTS` whose
+        name the file holds. Of a cost of one's own it holds none: the task then has the mean
+        distance to the goal as cost.
 
         Raises:
             ValueError: if the file is of version 0.1, which stores no task, its description of the
@@ -107,11 +108,12 @@ class SavedPlan:
         if name in task_names():
             registered = make_task(name, resolution)
             return dataclasses.replace(registered, body=self.body, **settings)
+        cost = COSTS.get(str(told.get("cost")), distance_cost)
         return Task(
             body=self.body,
             goal=np.asarray(self.episode.goal),
-            running_cost=distance_cost,
-            terminal_cost=distance_cost,
+            running_cost=cost,
+            terminal_cost=cost,
             name=name,
             **settings,
         )
@@ -283,6 +285,7 @@ def _task_text(task: Task) -> dict[str, Any]:
         "resolution": task.resolution,
         **{name: getattr(task, name) for name in SETTINGS},
         "running_weight": task.running_weight,
+        "cost": next((name for name, cost in COSTS.items() if cost is task.terminal_cost), None),
         "time_step": task.time_step,
         "obstacles": [
             {"shape": type(obstacle).__name__}

@@ -54,14 +54,16 @@ from jaxsimp.tasks import garments
 from jaxsimp.tasks import draping
 
 # isort: split
-from jaxsimp.tasks.costs import MatchingCost, distance_cost, matching_distance
+from jaxsimp.tasks.costs import COSTS, MatchingCost, distance_cost, matching_distance
 from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
+from jaxsimp.tasks.reaching import reach
 from jaxsimp.tasks.registry import TaskFactory, make_task, register, task_names
 from jaxsimp.tasks.starts import CrumpledStart, FixedStart, TurnedStart
 from jaxsimp.tasks.task import Task, score
 
 __all__ = [
+    "COSTS",
     "CrumpledStart",
     "DrawFn",
     "Episode",
@@ -80,6 +82,7 @@ __all__ = [
     "garments",
     "make_task",
     "matching_distance",
+    "reach",
     "register",
     "rope",
     "score",

@@ -71,14 +71,16 @@ class CrumpledStart:
     Attributes:
         body: the body; it starts straight or flat on the table.
         goal: goal positions, shape (N, 3), metres.
+        place: x and y of the table that the picks begin around, metres.
     """
 
     body: Body
     goal: goals.Positions
+    place: tuple[float, float] = (0.0, 0.0)
 
     def __call__(self, seed: int) -> Episode:
         """The episode of a seed; this runs a simulation."""
-        return Episode(crumple(self.body, seed), self.goal)
+        return Episode(crumple(self.body, seed) + np.array([*self.place, 0.0]), self.goal)
 
 
 def _turn(positions: Float[Array, "N 3"], angle: Float[Array, ""]) -> Float[Array, "N 3"]:

@@ -24,7 +24,7 @@ from jaxsimp.dynamics import (
 )
 from jaxsimp.dynamics.arrays import require_positions
 from jaxsimp.dynamics.contact.obstacles import check_obstacles, has_table
-from jaxsimp.dynamics.pickers import require_limits
+from jaxsimp.dynamics.pickers import require_limits, top_speed
 from jaxsimp.tasks.check import check_costs, check_draw
 from jaxsimp.tasks.episode import (
     DrawFn,
@@ -146,7 +146,7 @@ class Task:
     @property
     def top_speed(self) -> float:
         """Largest speed of a picker, metres per second: midway along its longest displacement."""
-        return 1.5 * float(np.linalg.norm(self.limits)) / self.action_seconds
+        return top_speed(self.limits, self.action_seconds)
 
     def pickers(self) -> Pickers:
         """Limits of the pickers' motion, at the task's time step."""

@@ -128,8 +128,8 @@ def planned(seed: int = 6, **options) -> Plan:
 
 def test_each_body_starts_from_the_plan_before_and_the_last_is_no_worse():
     asked = []
-    plan = planned(on_ask=lambda: asked.append(None))
-    assert len(asked) == 2 + 2 + 2
+    plan = planned(10, on_ask=lambda: asked.append(None))
+    assert len(asked) == 2 * 2 + 2 + 2  # two searches on the coarsest
     ids = {5: [0, 2, 4], 9: [0, 4, 8], 17: CANDIDATES.tolist()}
     tasks = [each.task for each in planner().planners]
     for part, task in zip(plan.parts, tasks, strict=True):
@@ -144,7 +144,7 @@ def test_each_body_starts_from_the_plan_before_and_the_last_is_no_worse():
         off = np.abs(part.actions.displacement - carried.displacement).max()
         assert off < 0.15 * 0.2 * 5  # five deviations
     carried = carry_over(starts[-1].actions, tasks[1].body, tasks[2].body)
-    episode = small_task(17).episode_fn(6)
+    episode = small_task(17).episode_fn(10)
     execute = planner().execute
     # What is settled is rounded otherwise in an execution, see test_planner.py.
     assert execute(episode, plan.actions).score >= execute(episode, carried).score - 1e-5
@@ -167,9 +167,10 @@ def test_each_body_has_noise_of_its_own(monkeypatch):
 
 def test_counts_and_seconds_add_up():
     plan = planned()
-    # Twelve draws; then two starts, six settled, the cost of the plan that is returned.
-    assert [part.num_rollouts for part in plan.parts] == [12, 2 + 6 + 1, 2 + 6 + 1]
-    assert [part.price for part in plan.parts] == [12, 2 + 24 + 1, 2 + 24 + 1]
+    # Twice twelve draws, and the execution of both plans; then two starts, six settled, the cost
+    # of the plan that is returned.
+    assert [part.num_rollouts for part in plan.parts] == [2 * (12 + 1), 2 + 6 + 1, 2 + 6 + 1]
+    assert [part.price for part in plan.parts] == [2 * (12 + 4), 2 + 24 + 1, 2 + 24 + 1]
     for name in ("num_rollouts", "price", "seconds", "compile_seconds"):
         assert getattr(plan, name) == sum(getattr(part, name) for part in plan.parts)
     assert plan.optimum is plan.parts[-1].optimum

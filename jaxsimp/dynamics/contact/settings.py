@@ -112,6 +112,21 @@ def listing_distances(
     return touching, reach, SEARCH * reach.max()
 
 
+def longest_contact_step(body: Body, top_speed: float) -> float:
+    """Longest time step, seconds, at which layers touch reliably.
+
+    Args:
+        body: the body.
+        top_speed: fastest that a picker moves, metres per second, above 0.
+    """
+    return _most_layers(body) * body.material.thickness / top_speed
+
+
+def _most_layers(body: Body) -> float:
+    """Largest distance that a picker may move in a time step, in thicknesses."""
+    return MOST_LAYERS_OF_SHEETS if len(body.faces) else MOST_LAYERS_OF_ROPES
+
+
 def make_self_contact(
     body: Body,
     time_step: float,
@@ -140,8 +155,7 @@ def make_self_contact(
     require_number("friction", friction, 0.0, 1e3)
     require_number("top_speed", top_speed, 0.0, MOST_SPEED, "m/s")
     is_sheet = len(body.faces) > 0
-    layers = MOST_LAYERS_OF_SHEETS if is_sheet else MOST_LAYERS_OF_ROPES
-    fastest = layers * thickness / time_step
+    fastest = _most_layers(body) * thickness / time_step
     if not 0 < top_speed <= fastest:
         raise ValueError(
             f"pickers move at up to {top_speed:.3g} m/s; layers of {1e3 * thickness:.3g} mm touch "

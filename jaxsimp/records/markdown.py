@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxsimp import records
+from jaxsimp.records.files import whole_file
+from jaxsimp.records.rows import environments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,14 +39,14 @@ def save_figure(figure: "Figure", path: Path) -> None:
     """Write a figure as PNG, whole or not at all, and close it."""
     import matplotlib.pyplot as plt
 
-    with records.whole_file(path) as part:
+    with whole_file(path) as part:
         figure.savefig(part, dpi=150)
     plt.close(figure)
 
 
 def provenance(rows: Iterable[dict[str, Any]], files: str) -> list[str]:
     """Lines on the software and machine behind the rows of a study, and on its files."""
-    found = records.environments(rows)
+    found = environments(rows)
     lines = ["## Provenance"]
     if len(found) == 1:
         ((environment, _),) = found

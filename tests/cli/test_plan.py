@@ -1,0 +1,106 @@
+"""The command from a goal to a plan: what it writes, resumes and refuses."""
+
+import json
+
+import numpy as np
+import pytest
+
+import jaxsimp as js
+from jaxsimp import goal_plan, goals
+from jaxsimp.cli.main import main
+from jaxsimp.planning import CEM, Joint
+
+ROPE = js.rope(11, 0.4)
+L_SHAPE = goals.polyline(ROPE, np.array([[0.0, 0.0], [0.25, 0.0], [0.25, 0.15]]))
+SMALL = CEM(num_iterations=3, population=24, initial_populations=1, encoding=Joint())
+
+
+@pytest.fixture(autouse=True)
+def small_search(monkeypatch, tmp_path):
+    monkeypatch.setitem(goal_plan.SEARCHES, "default", SMALL)
+    monkeypatch.chdir(tmp_path)
+    np.save("l.npy", L_SHAPE)
+
+
+def command(*options):
+    """What `jaxsimp plan` does, without another process."""
+    return main(["plan", *map(str, options)])
+
+
+def test_a_goal_becomes_a_folder_with_plan_report_and_figures(tmp_path, capsys):
+    status = command("l.npy", "--seeds", 2, "--json", "result.json")
+    result = json.loads((tmp_path / "result.json").read_text())
+    folder = tmp_path / "l-plan"
+    assert json.loads((folder / "result.json").read_text()) == result
+    assert result["key_points"] == [0, 6, 10]
+    assert result["num_actions"] == 4
+    assert result["score"] == max(result["scores"])
+    assert len(result["scores"]) == 2
+    assert status == (0 if result["success"] else 1)
+    assert 0 < result["mujoco_full_score"] <= 1
+    saved = js.load_plan(result["plan"])
+    assert saved.about["score"] == result["score"]
+    for name in ("plan.png", "key_points.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    report = (folder / "report.md").read_text()
+    assert f"| score of the best plan | {result['score']:.3f} |" in report
+    assert "l-plan/report.md" in capsys.readouterr().out
+
+
+def test_the_same_command_resumes(tmp_path, monkeypatch):
+    command("l.npy", "--seeds", 2, "--no-verify")
+    folder = tmp_path / "l-plan"
+    rows = (folder / "plans.jsonl").read_text()
+    planned = []
+    original = goal_plan.GoalPlanner.plan
+
+    def watched(self, seed=0, *rest):
+        planned.append(seed)
+        return original(self, seed, *rest)
+
+    monkeypatch.setattr(goal_plan.GoalPlanner, "plan", watched)
+    command("l.npy", "--seeds", 2, "--no-verify")
+    assert planned == []
+    assert (folder / "plans.jsonl").read_text() == rows
+    (folder / "plans" / "1.npz").unlink()
+    command("l.npy", "--seeds", 2, "--no-verify")
+    assert planned == [1]
+    assert "mujoco_full_score" not in json.loads((folder / "result.json").read_text())
+
+
+def test_another_goal_has_another_folder(capsys):
+    command("l.npy", "--no-verify")
+    np.save("l.npy", goals.turn(L_SHAPE, 0.3))
+    assert command("l.npy", "--no-verify") == 2
+    assert "made with another configuration" in capsys.readouterr().err
+
+
+def test_named_goals_and_a_start_of_ones_own(tmp_path):
+    np.savez("rope.npz", rest=ROPE.rest)
+    np.save("start.npy", L_SHAPE + np.array([0.0, 0.1, 0.0]))
+    options = ("--body", "rope.npz", "--start", "start.npy", "--actions", 1, "--no-verify")
+    command("--letter", "C", *options, "--out", "here")
+    saved = js.load_plan(tmp_path / "here" / "plan.npz")
+    np.testing.assert_allclose(saved.episode.start[0], L_SHAPE[0] + [0.0, 0.1, 0.0], atol=1e-6)
+    np.testing.assert_allclose(saved.episode.goal, goals.letter(saved.body, "C"), atol=1e-6)
+    assert len(saved.actions.pick) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "0 goals are given to plan for"),
+        (("l.npy", "--letter", "M"), "2 goals are given to plan for"),
+        (("l.npy", "--planner", "best"), "planner is 'best'"),
+        (("l.npy", "--seeds", 0), "seeds is 0"),
+        (("l.npy", "--cost", "speed"), "cost is 'speed'"),
+        (("l.npy", "--json", "none/result.json"), "none is no folder"),
+        (("none.npy",), "none.npy"),
+        (("l.npy", "--start", "none.npy"), "none.npy"),
+        (("--fold", "twice"), "fold is 'twice'"),
+    ],
+)
+def test_what_is_refused(tmp_path, capsys, options, message):
+    assert command(*options) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["l.npy"]
