@@ -60,6 +60,7 @@ if TYPE_CHECKING:
         Capsule,
         Obstacle,
         Pickers,
+        Pinch,
         Plane,
         Simulation,
         Sphere,
@@ -172,6 +173,7 @@ __all__ = [
     "Obstacle",
     "Optimum",
     "Pickers",
+    "Pinch",
     "Plan",
     "Plane",
     "Planner",
@@ -255,8 +257,8 @@ _ROOMS = {
     "towel trousers",
     "calibration": "Calibration CalibrationConfig Recording calibrate recording_error "
     "simulate_recordings",
-    "dynamics": "NONE Actions Box Capsule Obstacle Pickers Plane Simulation Sphere State Table "
-    "at_rest largest_time_step least_radius make_pickers make_simulation rollout settle "
+    "dynamics": "NONE Actions Box Capsule Obstacle Pickers Pinch Plane Simulation Sphere State "
+    "Table at_rest largest_time_step least_radius make_pickers make_simulation rollout settle "
     "table_with_edge",
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
     "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",

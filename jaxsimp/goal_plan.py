@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaxsimp import goals, records
 from jaxsimp.bodies import Body
 from jaxsimp.checks import require_choice, require_seed
-from jaxsimp.dynamics import Actions, Obstacle, Table
+from jaxsimp.dynamics import Actions, Obstacle, Pinch, Table
 from jaxsimp.engines import Execution, replay
 from jaxsimp.planning import (
     CEM,
@@ -190,6 +190,7 @@ def goal_planner(
     num_pickers: int = 2,
     limits: tuple[float, float, float] | None = None,
     obstacles: tuple[Obstacle, ...] = (Table(),),
+    pinch: Pinch | None = None,
     name: str = "reach",
 ) -> GoalPlanner:
     """A planner for a goal of your own.
@@ -207,6 +208,7 @@ def goal_planner(
         num_pickers: number of pickers.
         limits: largest displacement of an action, as for `jaxsimp.reach`.
         obstacles: rigid bodies at rest.
+        pinch: what a picker holds besides the particle that an action names.
         name: name of the task.
 
     Raises:
@@ -224,6 +226,7 @@ def goal_planner(
         num_pickers=num_pickers,
         limits=limits,
         obstacles=obstacles,
+        pinch=pinch,
         name=name,
     )
     return GoalPlanner(task, key_points, search)

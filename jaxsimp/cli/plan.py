@@ -71,6 +71,9 @@ class Options:
     """Number of actions; by default what the goal needs."""
     limits: Annotated[XYZ | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Largest displacement of an action along x, y and z, metres; by default by the body's size."""
+    pinch: Annotated[tuple[float, int] | None, tyro.conf.arg(metavar="RADIUS LAYERS")] = None
+    """Fingers that hold all within a radius, metres, and so many layers on either side of the
+    particle's own; that particle alone by default."""
     seeds: int = 1
     """Number of plans, of which the one of the highest score is kept."""
     tolerance: float | None = None
@@ -171,6 +174,7 @@ def planner_of(options: Options) -> "GoalPlanner":
         num_actions=options.actions,
         num_pickers=options.pickers,
         limits=options.limits,
+        pinch=jaxsimp.Pinch(*options.pinch) if options.pinch else None,
         name=options.name,
     )
 
@@ -210,6 +214,7 @@ def config(planner: "GoalPlanner") -> dict[str, Any]:
         "num_actions": planner.planner.task.num_actions,
         "num_pickers": task.num_pickers,
         "limits": list(task.limits),
+        "pinch": None if task.pinch is None else vars(task.pinch),
         "action_seconds": task.action_seconds,
         "time_step": task.time_step,
     }

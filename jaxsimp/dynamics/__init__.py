@@ -10,7 +10,7 @@ from jaxsimp.dynamics.contact.obstacles import (
     least_radius,
     table_with_edge,
 )
-from jaxsimp.dynamics.pickers import NONE, Actions, Pickers, make_pickers
+from jaxsimp.dynamics.pickers import NONE, Actions, Pickers, Pinch, make_pickers
 from jaxsimp.dynamics.rollouts import rollout, rollout_observing, settle
 from jaxsimp.dynamics.simulation import (
     Simulation,
@@ -27,6 +27,7 @@ __all__ = [
     "Capsule",
     "Obstacle",
     "Pickers",
+    "Pinch",
     "Plane",
     "Simulation",
     "Sphere",

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsimp.checks import require_count, require_number, require_numbers
+from jaxsimp.checks import keep, require_count, require_number, require_numbers
 from jaxsimp.dynamics.arrays import as_array, require_known
 from jaxsimp.dynamics.contact.obstacles import Obstacle, Table
 
@@ -24,6 +24,10 @@ LEAST_LIMIT, MOST_LIMIT = 1e-6, 1e3
 """Range of the largest displacement of an action, metres."""
 LEAST_STRETCH, MOST_STRETCH = 1.0001, 1e6
 """Range of `Pickers.max_stretch`; the largest is none."""
+MOST_LAYERS = 1000
+"""Most layers of a pinch."""
+SPARE_LAYERS = 0.5
+"""Height beyond those layers in which a pinch holds, in layers: they are seldom level."""
 MOST_STEPS = 10_000_000
 """Most time steps of an action."""
 TOUCHES = 16
@@ -48,8 +52,34 @@ class Actions:
     displacement: Float[Array, "*T G 3"]
 
 
+@dataclass(frozen=True)
+class Pinch:
+    """Fingers that hold what is between them, as grippers do, and not the named particle alone.
+
+    A picker holds every particle that is, at the start of an action, within `radius` of the named
+    one as seen from above, and at most `layers` layers above or below it.
+
+    Attributes:
+        radius: radius of a fingertip, metres.
+        layers: number of layers held on either side of the named particle's own; 1 for both sheets
+            of a garment, 3 for both of a garment folded once.
+
+    Raises:
+        ValueError: if a number is out of its range.
+    """
+
+    radius: float
+    layers: int = 1
+
+    def __post_init__(self) -> None:
+        radius = require_number("radius", self.radius, 0.0, MOST_LIMIT, "m")
+        keep(self, radius=radius, layers=require_count("layers", self.layers, 0, MOST_LAYERS))
+
+
 @partial(
-    jax.tree_util.register_dataclass, data_fields=["limits", "max_stretch"], meta_fields=["steps"]
+    jax.tree_util.register_dataclass,
+    data_fields=["limits", "max_stretch"],
+    meta_fields=["steps", "pinch"],
 )
 @dataclass(frozen=True)
 class Pickers:
@@ -57,30 +87,41 @@ class Pickers:
 
     Attributes:
         limits: largest displacement of one action along x, y, z, shape (3,), metres.
-        max_stretch: upper bound on the distance of two held particles, as a multiple of their rest
+        max_stretch: upper bound on the distance of two named particles, as a multiple of their rest
             distance.
         steps: number of time steps of one action; static.
+        pinch: what fingers hold besides the named particle; None for that particle alone; static.
     """
 
     limits: Float[Array, "... 3"]
     max_stretch: Float[Array, "..."]
     steps: int
+    pinch: Pinch | None = None
 
 
 def make_pickers(
     limits: tuple[float, float, float] = (0.08, 0.08, 0.08),
     max_stretch: float = 1.2,
     steps: int = 150,
+    pinch: Pinch | None = None,
 ) -> Pickers:
     """Pickers with the stretch rule of SoftGym (1.2) and the limits of the paper's author.
 
     Raises:
-        ValueError: if a number is out of its range.
+        ValueError: if a number is out of its range, or `pinch` is none.
     """
+    require_pinch(pinch)
     limits = require_limits(limits)
     require_number("max_stretch", max_stretch, LEAST_STRETCH, MOST_STRETCH)
     steps = require_count("steps", steps, 1, MOST_STEPS)
-    return Pickers(jnp.asarray(limits, dtype=float), jnp.asarray(max_stretch, dtype=float), steps)
+    found = jnp.asarray(limits, dtype=float), jnp.asarray(max_stretch, dtype=float)
+    return Pickers(*found, steps, pinch)
+
+
+def require_pinch(pinch: Any) -> None:
+    """Raise a `ValueError` unless it is a `Pinch`, or None."""
+    if pinch is not None and not isinstance(pinch, Pinch):
+        raise ValueError(f"pinch is {pinch!r}; give Pinch(radius, layers), or None")
 
 
 def require_limits(limits: Any) -> tuple[float, float, float]:
@@ -186,6 +227,10 @@ def grasp(
     distance of two particles is convex in time, so it is never larger than at both ends.) A picker
     holds nothing if its id is not that of a particle, be it `NONE` or out of range.
 
+    With a pinch, what else is between the fingers moves as the named particle does; the lowest of
+    it stays out of the obstacles, and a particle between the fingers of several pickers is held by
+    the one that names it, or else by the first.
+
     Args:
         pickers: limits of the pickers' motion.
         rest: rest coordinates of the body, metres.
@@ -200,6 +245,12 @@ def grasp(
     """
     holds = _holds(action.pick, len(position))
     start = position[action.pick]
+    named = holds[:, None] & (action.pick[:, None] == jnp.arange(len(position))[None])
+    chosen = named
+    if pickers.pinch is not None:
+        chosen = _pinched(pickers.pinch, named, 2 * radius, start, position)
+        lowest = jnp.where(chosen, position[None, :, 2], start[:, None, 2]).min(axis=1)
+        radius = radius + start[:, 2] - lowest
     target = start + jnp.clip(action.displacement, -pickers.limits[None], pickers.limits[None])
     target = _outside(obstacles, radius, target)
     if not all(isinstance(each, Table) for each in obstacles):  # no path is through the table alone
@@ -208,12 +259,29 @@ def grasp(
         allowed = _allowed(pickers, rest[action.pick], target, holds)
         target = jnp.where(allowed[:, None], target, start)
     moves = target - start
-    chosen = holds[:, None] & (action.pick[:, None] == jnp.arange(len(position))[None])
     return chosen.any(axis=0), chosen.T.astype(moves.dtype) @ moves
 
 
+def _pinched(
+    pinch: Pinch,
+    named: Bool[Array, "G N"],
+    thickness: Float[Array, ""],
+    start: Float[Array, "G 3"],
+    position: Float[Array, "N 3"],
+) -> Bool[Array, "G N"]:
+    """Whether each picker holds each particle; no particle is held by two."""
+    x, y, z = jnp.moveaxis(position[None] - start[:, None], 2, 0)
+    between = (x**2 + y**2 <= pinch.radius**2) & (
+        jnp.abs(z) <= (pinch.layers + SPARE_LAYERS) * thickness
+    )
+    holds = named.any(axis=1, keepdims=True)
+    wanted = named | (between & holds & ~named.any(axis=0)[None])
+    first = jnp.cumsum(wanted, axis=0) == 1
+    return wanted & first
+
+
 def _outside(
-    obstacles: Sequence[Obstacle], radius: Float[Array, ""], target: Float[Array, "G 3"]
+    obstacles: Sequence[Obstacle], radius: Float[Array, "*G"], target: Float[Array, "G 3"]
 ) -> Float[Array, "G 3"]:
     """Targets pushed out of obstacles, one after another."""
     for obstacle in obstacles:
@@ -231,7 +299,7 @@ def _outside(
 def _cut(
     pickers: Pickers,
     obstacles: Sequence[Obstacle],
-    radius: Float[Array, ""],
+    radius: Float[Array, "*G"],
     start: Float[Array, "G 3"],
     target: Float[Array, "G 3"],
 ) -> Float[Array, "G 3"]:
@@ -247,7 +315,7 @@ def _cut(
 
 def _clear_share(
     obstacle: Obstacle,
-    radius: Float[Array, ""],
+    radius: Float[Array, "*G"],
     start: Float[Array, "G 3"],
     target: Float[Array, "G 3"],
 ) -> Float[Array, " G"]:

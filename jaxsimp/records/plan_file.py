@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from jaxsimp.bodies import Body, Material
 from jaxsimp.checks import as_reals
-from jaxsimp.dynamics import Actions, Obstacle
+from jaxsimp.dynamics import Actions, Obstacle, Pinch
 from jaxsimp.dynamics.arrays import as_array
 from jaxsimp.dynamics.contact.obstacles import SHAPES
 from jaxsimp.dynamics.pickers import checked_actions, require_actions
@@ -99,6 +99,7 @@ class SavedPlan:
                 "running_weight": told.get("running_weight", 1.0),
                 "episode_fn": FixedStart(self.episode),
                 "obstacles": _obstacles(told),
+                "pinch": None if told.get("pinch") is None else Pinch(**told["pinch"]),
             }
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
@@ -287,6 +288,7 @@ def _task_text(task: Task) -> dict[str, Any]:
         "running_weight": task.running_weight,
         "cost": next((name for name, cost in COSTS.items() if cost is task.terminal_cost), None),
         "time_step": task.time_step,
+        "pinch": None if task.pinch is None else dataclasses.asdict(task.pinch),
         "obstacles": [
             {"shape": type(obstacle).__name__}
             | {name: np.asarray(number).tolist() for name, number in vars(obstacle).items()}

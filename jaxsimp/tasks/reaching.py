@@ -7,7 +7,7 @@ from jaxtyping import Float
 from jaxsimp import goals
 from jaxsimp.bodies import Body
 from jaxsimp.checks import require_choice, require_count
-from jaxsimp.dynamics import Obstacle, Table, at_rest
+from jaxsimp.dynamics import Obstacle, Pinch, Table, at_rest
 from jaxsimp.dynamics.arrays import require_positions
 from jaxsimp.dynamics.contact.settings import longest_contact_step
 from jaxsimp.dynamics.pickers import require_limits, top_speed
@@ -38,6 +38,7 @@ def reach(
     num_pickers: int = 2,
     limits: tuple[float, float, float] | None = None,
     obstacles: tuple[Obstacle, ...] = (Table(),),
+    pinch: Pinch | None = None,
     name: str = "reach",
 ) -> Task:
     """A task: bring a body from a start to a goal.
@@ -58,6 +59,7 @@ def reach(
             of the paper's tasks, in sizes of the body (2/3 for sheets, 0.28 for ropes), or more if
             the goal is so far away that `num_actions` would not reach it.
         obstacles: rigid bodies at rest, in the order in which they act.
+        pinch: what a picker holds besides the particle that an action names.
         name: name of the task.
 
     Raises:
@@ -94,6 +96,7 @@ def reach(
         action_seconds=seconds,
         longest_time_step=min(Task.longest_time_step, 0.99 * longest_contact_step(body, fastest)),
         obstacles=obstacles,
+        pinch=pinch,
         name=name,
     )
 

@@ -24,7 +24,7 @@ from jaxsimp.dynamics import (
 )
 from jaxsimp.dynamics.arrays import require_positions
 from jaxsimp.dynamics.contact.obstacles import check_obstacles, has_table
-from jaxsimp.dynamics.pickers import require_limits, top_speed
+from jaxsimp.dynamics.pickers import Pinch, require_limits, require_pinch, top_speed
 from jaxsimp.tasks.check import check_costs, check_draw
 from jaxsimp.tasks.episode import (
     DrawFn,
@@ -62,6 +62,7 @@ class Task:
         running_weight: weight of the running costs in the cost of a plan, in which the terminal
             cost counts once; 1 for the paper's sum.
         obstacles: rigid bodies at rest, in the order in which they act.
+        pinch: what a picker holds besides the particle that an action names; None for that alone.
         draw_fn: function from a key to an episode, in pure JAX; None if `episode_fn` alone makes
             episodes.
         name: name of the task; for a registered task that of its factory, see `register`.
@@ -87,6 +88,7 @@ class Task:
     longest_time_step: float = 2e-3
     running_weight: float = 1.0
     obstacles: tuple[Obstacle, ...] = (Table(),)
+    pinch: Pinch | None = None
     draw_fn: DrawFn | None = None
     name: str = "unnamed"
     resolution: int | None = None
@@ -98,6 +100,7 @@ class Task:
             "limits": require_limits(self.limits),
             "running_weight": require_number("running_weight", self.running_weight, 0.0, 1e6),
         }
+        require_pinch(self.pinch)
         if not isinstance(self.name, str):
             raise ValueError(f"name is {self.name!r}; give a text")
         for name, counts in COUNTS.items():
@@ -150,7 +153,7 @@ class Task:
 
     def pickers(self) -> Pickers:
         """Limits of the pickers' motion, at the task's time step."""
-        return make_pickers(self.limits, steps=self.action_steps)
+        return make_pickers(self.limits, steps=self.action_steps, pinch=self.pinch)
 
     @property
     def time_step(self) -> float:

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsimp import goals
-from jaxsimp.bodies import cloth, rope
+from jaxsimp.bodies import cloth, rope, t_shirt
 from jaxsimp.dynamics import (
     NONE,
     Actions,
+    Pinch,
     Table,
     at_rest,
     make_pickers,
@@ -380,3 +381,94 @@ def test_under_jit_an_id_out_of_range_grasps_nothing_and_a_displacement_of_nan_f
     # The other picker carries on.
     np.testing.assert_allclose(one[0], idle[0] + 0.01, atol=1e-6)
     assert np.isnan(failed).any()
+
+
+# --- fingers that pinch ---------------------------------------------------------------------------
+
+
+def pinched(pinch: Pinch | None, position: np.ndarray, pick: list[int], moves: list[list[float]]):
+    """Held particles and their displacements, of a body whose particles are 4 mm thick."""
+    pickers = make_pickers((0.3, 0.3, 0.3), max_stretch=1e6, pinch=pinch)
+    place = jnp.asarray(position, float)
+    action = Actions(jnp.asarray(pick), jnp.asarray(moves, float))
+    held, moved = grasp(pickers, place, (Table(),), jnp.asarray(0.002), place, action)
+    return np.flatnonzero(held).tolist(), np.asarray(moved)
+
+
+STACK = np.array(
+    # Four layers, 4 mm apart, and beside them a particle 12 mm away.
+    [
+        [0.0, 0.0, 0.002],
+        [0.0, 0.0, 0.006],
+        [0.001, 0.0, 0.010],
+        [0.0, 0.0, 0.014],
+        [0.012, 0, 0.002],
+    ]
+)
+UP = [0.1, 0.0, 0.05]
+
+
+@pytest.mark.parametrize(
+    ("pinch", "pick", "expected"),
+    [
+        (None, [1], [1]),
+        (Pinch(0.005, 0), [1], [1]),
+        (Pinch(0.005, 1), [1], [0, 1, 2]),
+        (Pinch(0.005, 1), [3], [2, 3]),
+        (Pinch(0.005, 3), [0], [0, 1, 2, 3]),
+        (Pinch(0.0005, 3), [0], [0, 1, 3]),
+        (Pinch(0.02, 1), [0], [0, 1, 4]),
+        (Pinch(0.02, 3), [NONE], []),
+    ],
+)
+def test_a_pinch_holds_what_is_between_the_fingers(pinch, pick, expected):
+    held, moves = pinched(pinch, STACK, pick, [UP])
+    assert held == expected
+    for particle, move in enumerate(moves):
+        # The difference of two positions in float32, of up to 0.1 m.
+        np.testing.assert_allclose(move, UP if particle in expected else 0.0, atol=1e-8)
+
+
+def test_the_lowest_layer_of_a_pinch_stays_above_the_table():
+    down = [0.0, 0.0, -0.1]
+    raised = STACK + np.array([0.0, 0.0, 0.03])
+    held, moves = pinched(Pinch(0.005, 3), raised, [3], [down])
+    assert held == [0, 1, 2, 3]
+    np.testing.assert_allclose(raised[0, 2] + moves[0, 2], 0.002, atol=1e-7)
+    np.testing.assert_allclose(moves[:4], np.tile(moves[0], (4, 1)), atol=1e-8)
+
+
+def test_who_names_a_particle_holds_it_and_nobody_else():
+    held, moves = pinched(Pinch(0.02, 3), STACK, [0, 4], [UP, [0.0, 0.1, 0.05]])
+    assert held == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(moves[:4], np.tile(UP, (4, 1)), atol=1e-8)
+    np.testing.assert_allclose(moves[4], [0.0, 0.1, 0.05], atol=1e-8)
+
+
+def test_both_sheets_follow_a_pinch_in_a_rollout():
+    shirt = t_shirt(num_particles=120, sheets=2).body
+    start = goals.flat(shirt)
+    corner = int(np.lexsort((start[:, 1], start[:, 0]))[0])
+    near = np.linalg.norm(start[:, :2] - start[corner, :2], axis=1) <= 0.1
+    simulation = make_simulation(shirt, 1e-3, self_contact=True)
+    actions = Actions(jnp.array([[corner]]), jnp.array([[[0.05, 0.0, 0.05]]]))
+    pickers = make_pickers((0.2, 0.2, 0.2), steps=200, pinch=Pinch(0.1, 1))
+    _, (end,) = jax.jit(rollout)(simulation, pickers, at_rest(jnp.asarray(start, float)), actions)
+    assert near.sum() >= 2
+    assert np.ptp(start[near, 2]) > 0.9 * shirt.material.thickness  # both sheets
+    # Held particles follow exactly, up to the sum of 200 steps in float32.
+    np.testing.assert_allclose(end[near], start[near] + [0.05, 0.0, 0.05], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Pinch(-0.1, 1), "radius is -0.1"),
+        (lambda: Pinch(0.1, -1), "layers is -1"),
+        (lambda: make_pickers(pinch=0.1), "pinch is 0.1; give Pinch"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked_shapes")
+def test_wrong_pinches_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments import markdown, plan_report
+from experiments import plan_report
 
 
 @pytest.mark.parametrize(

@@ -97,6 +97,8 @@ def replay(
     episodes = [require_episode(episode, task.body.num_particles) for episode in episodes]
     plans = [require_actions(plan, task.body.num_particles) for plan in plans]
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
+    if task.pinch is not None:  # what is between the fingers depends on the motion
+        picked = set(range(task.body.num_particles))
     model = make_model(task.body, variant, picked, obstacles=task.obstacles)
     one = partial(_replay_one, task, task.simulation(), model, jax.jit(partial(score, task)))
     return _side_by_side(one, episodes, plans, num_workers or num_cores())
@@ -148,7 +150,7 @@ class _Scene:
         self._model, self._data = model, mujoco.MjData(model)
         self._data.qpos[:] = (start - task.body.rest).ravel()
         self._steps = max(1, round(task.action_seconds / model.opt.timestep))
-        self._pickers = make_pickers(task.limits, steps=self._steps)
+        self._pickers = make_pickers(task.limits, steps=self._steps, pinch=task.pinch)
         speed = np.asarray(speed_profile(self._steps), dtype=float)
         self._ahead = np.cumsum(speed) + (LEAD - 1) * speed
         self.unstable = False
