@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import plan_report
+from jaxsimp.records import markdown
 
 
 @pytest.mark.parametrize(
