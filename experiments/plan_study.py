@@ -13,8 +13,8 @@ from experiments.planners import (
     NamedPlanner,
     Search,
     cem_of,
-    num_stages,
     settings,
+    stages_of_task,
     with_cem,
 )
 from jaxsimp.checks import require_count, require_seed
@@ -128,11 +128,15 @@ class PlanStudy:
         planner = planner or self.planners[0]
         task = make_task(name, self.resolution, quick=self.quick)
         changed = self.named(planner).task(task, self.num_actions)
-        return staged_task(changed, num_stages(task)) if self.in_stages(task, planner) else changed
+        return (
+            staged_task(changed, stages_of_task(task)) if self.in_stages(task, planner) else changed
+        )
 
     def in_stages(self, task: Task, planner: str) -> bool:
         """Whether a planner plans for a task in stages."""
-        return self.named(planner).in_stages and num_stages(task) > 0 and self.num_actions is None
+        return (
+            self.named(planner).in_stages and stages_of_task(task) > 0 and self.num_actions is None
+        )
 
     def planner(self, name: str, planner: str) -> AnyPlanner:
         """A planner of a task, by their names."""

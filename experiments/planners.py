@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxsimp.goals import find_folds
 from jaxsimp.planning import (
     CEM,
     PRICES,
@@ -19,8 +18,8 @@ from jaxsimp.planning import (
     Reranking,
     Sequence,
     default_algorithm,
+    num_stages,
     stage_algorithm,
-    stages_of,
 )
 from jaxsimp.planning.algorithm import stages
 from jaxsimp.tasks import Task, make_task
@@ -98,7 +97,7 @@ def _smoke(task: Task) -> Sequence:
 
 
 def _default(task: Task) -> Sequence:
-    return stage_algorithm() if num_stages(task) else default_algorithm(task)
+    return stage_algorithm() if stages_of_task(task) else default_algorithm(task)
 
 
 def _one_piece(task: Task) -> CEM:
@@ -106,19 +105,14 @@ def _one_piece(task: Task) -> CEM:
     return CEM(num_iterations=40, smoothing=0.2, encoding=Joint())
 
 
-def num_stages(task: Task) -> int:
-    """Number of stages of plans for a task's goal if it has several folds; 0 otherwise."""
-    return _num_stages(task.name, task.resolution) if len(task.body.faces) else 0
+def stages_of_task(task: Task) -> int:
+    """`jaxsimp.planning.num_stages` of a registered task, found once."""
+    return _num_stages(task.name, task.resolution)
 
 
 @cache
 def _num_stages(name: str, resolution: int) -> int:
-    task = make_task(name, resolution)
-    try:
-        has_several = len(find_folds(task.body, task.goal)) > 1
-    except ValueError:
-        return 0
-    return len(stages_of(task, task.goal)) if has_several else 0
+    return num_stages(make_task(name, resolution))
 
 
 PLANNERS = {

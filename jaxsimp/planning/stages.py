@@ -275,8 +275,9 @@ def _chained(plans: list[Actions], idle: int) -> Actions:
 
 
 def num_stages(task: Task) -> int:
-    """Number of stages of a goal of several folds; 0 for any other, which is one search's work."""
-    if not len(task.body.faces):
+    """Number of stages of a goal of several folds from a flat start; 0 for any other task."""
+    body = task.body
+    if not len(body.faces) or not _starts_flat(task):
         return 0
     try:
         has_several = len(find_folds(task.body, task.goal)) > 1
@@ -304,3 +305,9 @@ def planner_of(
     """
     kind = StagedPlanner if num_stages(task) else Planner
     return kind(task, engine, evaluator, layout)
+
+
+def _starts_flat(task: Task) -> bool:
+    """Whether no layers lie on each other at the start: of two sheets, no more than at rest."""
+    start, rest = np.asarray(task.episode_fn(0).start), task.body.rest
+    return bool(np.ptp(start[:, 2]) < np.ptp(rest[:, 2]) + task.body.radius)

@@ -54,6 +54,9 @@ from jaxsimp.tasks import garments
 from jaxsimp.tasks import draping
 
 # isort: split
+from jaxsimp.tasks import strips
+
+# isort: split
 from jaxsimp.tasks.costs import COSTS, MatchingCost, distance_cost, matching_distance
 from jaxsimp.tasks.crumpling import crumple
 from jaxsimp.tasks.episode import DrawFn, Episode, EpisodeFn, RunningCost, TerminalCost
@@ -86,5 +89,6 @@ __all__ = [
     "register",
     "rope",
     "score",
+    "strips",
     "task_names",
 ]

@@ -37,7 +37,7 @@ def register(
     Args:
         full: resolution for studies.
         quick: resolution for tests and smoke runs.
-        group: name of a group of tasks: "paper", "goals" or "obstacles" here.
+        group: name of a group of tasks: "paper", "goals", "obstacles" or "folded" here.
 
     Raises:
         ValueError: if the name is taken, or a resolution is out of its range.

@@ -42,26 +42,32 @@ class FixedStart:
 
 @dataclass(frozen=True, eq=False)
 class TurnedStart:
-    """A flat body and its goal, both turned by the same random angle within 45 degrees.
+    """A start and its goal, both turned by the same random angle within 45 degrees.
 
     Attributes:
         body: the body.
         goal: goal before the turn, shape (N, 3), metres.
+        start: start before the turn, shape (N, 3), metres; the flat body by default.
     """
 
     body: Body
     goal: goals.Positions
+    start: goals.Positions | None = None
 
     def __call__(self, seed: int) -> Episode:
         """The episode of a seed."""
         angle = np.random.default_rng(require_seed(seed)).uniform(-LARGEST_ANGLE, LARGEST_ANGLE)
-        return Episode(goals.flat(self.body, angle), goals.turn(self.goal, angle))
+        return Episode(goals.turn(self._start, angle), goals.turn(self.goal, angle))
 
     def draw(self, key: PRNGKeyArray) -> Episode:
         """The episode of a key; keys and seeds give different angles."""
         angle = jax.random.uniform(key, minval=-LARGEST_ANGLE, maxval=LARGEST_ANGLE)
-        start, goal = goals.flat(self.body), self.goal
-        return Episode(_turn(_as_float(start), angle), _turn(_as_float(goal), angle))
+        start, goal = map(_as_float, (self._start, self.goal))
+        return Episode(_turn(start, angle), _turn(goal, angle))
+
+    @property
+    def _start(self) -> goals.Positions:
+        return goals.flat(self.body) if self.start is None else self.start
 
 
 @dataclass(frozen=True, eq=False)
