@@ -93,7 +93,7 @@ if TYPE_CHECKING:
         replay,
     )
     from jaxsimp.engines.mujoco import make_model, save_mjcf
-    from jaxsimp.goal_plan import GoalPlan, GoalPlanner, goal_planner, plan
+    from jaxsimp.goal_plan import GoalPlan, GoalPlanner, goal_planner, plan, plan_batch
     from jaxsimp.goals import Subgoal, find_folds, same_folds, subgoals
     from jaxsimp.planning import (
         CEM,
@@ -222,6 +222,7 @@ __all__ = [
     "make_task",
     "optimize",
     "plan",
+    "plan_batch",
     "planning",
     "reach",
     "recording_error",
@@ -263,7 +264,7 @@ _ROOMS = {
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
     "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",
-    "goal_plan": "GoalPlan GoalPlanner goal_planner plan",
+    "goal_plan": "GoalPlan GoalPlanner goal_planner plan plan_batch",
     "goals": "Subgoal find_folds same_folds subgoals",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical CoarseToFinePlanner Descent "
     "Encoding GaussianIndex Joint LocalSearch Optimum Plan Planner Plans RandomShooting "

@@ -5,7 +5,8 @@ It stands above all rooms: key points of the goal, a task that reaches it, and t
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence as Seq
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from jaxsimp.bodies import Body
 from jaxsimp.checks import require_choice, require_seed
 from jaxsimp.dynamics import Actions, Obstacle, Pinch, Table
 from jaxsimp.engines import Execution, replay
+from jaxsimp.goals import Positions
 from jaxsimp.planning import (
     CEM,
     Algorithm,
@@ -28,6 +30,7 @@ from jaxsimp.planning import (
     Sequence,
     StagedPlanner,
     default_algorithm,
+    num_stages,
     planner_of,
     stage_algorithm,
 )
@@ -119,16 +122,19 @@ class GoalPlanner:
         task: the task, with body and goal.
         key_points: key points of the goal, which the pickers may grasp.
         search: name of the search, in `SEARCHES`.
+        like: planner of another goal whose task is otherwise the same: what it compiled serves
+            both.
     """
 
     task: Task
     key_points: KeyPoints
     search: str = "default"
+    like: "GoalPlanner | None" = None
 
     @cached_property
     def planner(self) -> Planner | StagedPlanner:
         """The planner: in stages for a goal of several folds, else in one piece."""
-        return planner_of(self.task)
+        return self.like.planner if self.like else planner_of(self.task)
 
     @property
     def algorithm(self) -> Algorithm | Sequence:
@@ -175,12 +181,13 @@ class GoalPlanner:
             seeds = np.random.SeedSequence(seed).generate_state(ATTEMPTS).tolist()
             found, execution = planner.plan_best(episode, self.key_points, algorithm, seeds, on_ask)
         engine = str(planner.evaluator)
-        return GoalPlan(planner.task, episode, self.key_points, seed, found, execution, engine)
+        task = replace(self.task, num_actions=planner.task.num_actions)
+        return GoalPlan(task, episode, self.key_points, seed, found, execution, engine)
 
 
 def goal_planner(
     body: Body,
-    goal: goals.Positions,
+    goal: Positions,
     *,
     start: str | Float[np.ndarray, "N 3"] = "flat",
     search: str = "default",
@@ -232,7 +239,7 @@ def goal_planner(
     return GoalPlanner(task, key_points, search)
 
 
-def _num_actions(body: Body, goal: goals.Positions, key_points: KeyPoints) -> int:
+def _num_actions(body: Body, goal: Positions, key_points: KeyPoints) -> int:
     """The default number of actions."""
     if not len(body.faces):
         return 2 * math.ceil((len(key_points) + 1) / 2)
@@ -243,7 +250,7 @@ def _num_actions(body: Body, goal: goals.Positions, key_points: KeyPoints) -> in
     return STAGE_ACTIONS if len(folds) == 1 else SHEET_ACTIONS
 
 
-def plan(body: Body, goal: goals.Positions, seed: int = 0, **options: Any) -> GoalPlan:
+def plan(body: Body, goal: Positions, seed: int = 0, **options: Any) -> GoalPlan:
     """Plan how to bring a body to a goal, and carry the plan out.
 
     ```python
@@ -266,3 +273,38 @@ def plan(body: Body, goal: goals.Positions, seed: int = 0, **options: Any) -> Go
         TypeError: if there is no such option.
     """
     return goal_planner(body, goal, **options).plan(seed)
+
+
+def plan_batch(
+    body: Body,
+    goals: Seq[Positions] | Float[np.ndarray, "B N 3"],
+    seeds: Seq[int] | None = None,
+    **options: Any,
+) -> tuple[GoalPlan, ...]:
+    """`plan` for several goals of one body; what is compiled for one serves those like it.
+
+    Args:
+        body: the body.
+        goals: goal positions of each goal, shape (N, 3), metres.
+        seeds: seed of each search; 0 by default.
+        **options: options of `goal_planner`, for all goals.
+
+    Raises:
+        ValueError: if there are not as many seeds as goals, or `plan` raises.
+        TypeError: if there is no such option.
+    """
+    seeds = [0] * len(goals) if seeds is None else seeds
+    if len(seeds) != len(goals):
+        raise ValueError(
+            f"there are {len(goals)} goals and {len(seeds)} seeds; give a seed for each, or none"
+        )
+    made: dict[tuple[Any, ...], GoalPlanner] = {}
+    plans = []
+    for goal, seed in zip(goals, seeds, strict=True):
+        planner = goal_planner(body, goal, **options)
+        task = planner.task
+        alike = num_stages(task), task.num_actions, task.limits
+        planner = replace(planner, like=made.get(alike))
+        made.setdefault(alike, planner)
+        plans.append(planner.plan(seed))
+    return tuple(plans)

@@ -100,6 +100,22 @@ def test_plan_takes_the_options_of_the_planner():
     assert np.all(np.abs(plan.actions.displacement) <= np.array([0.1, 0.1, 0.05]) + 1e-6)
 
 
+def test_a_batch_of_goals_has_the_plans_of_each(monkeypatch):
+    made = []
+    original = goal_plan.planner_of
+    monkeypatch.setattr(goal_plan, "planner_of", lambda task: made.append(task) or original(task))
+    turned = goals.turn(L_SHAPE, 0.4)
+    plans = js.plan_batch(ROPE, [L_SHAPE, turned], [1, 2], search="cem")
+    assert len(made) == 1  # what is compiled serves both
+    for plan, goal, seed in zip(plans, (L_SHAPE, turned), (1, 2), strict=True):
+        alone = js.plan(ROPE, goal, seed, search="cem")
+        np.testing.assert_array_equal(plan.actions.displacement, alone.actions.displacement)
+        assert plan.score == alone.score
+        np.testing.assert_array_equal(plan.task.goal, goal)
+    with pytest.raises(ValueError, match="2 goals and 1 seeds"):
+        js.plan_batch(ROPE, [L_SHAPE, turned], [1], search="cem")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
