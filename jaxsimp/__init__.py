@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         calibration,
         dynamics,
         engines,
+        envs,
         goals,
         planning,
         records,
@@ -91,6 +92,7 @@ if TYPE_CHECKING:
         replay,
     )
     from jaxsimp.engines.mujoco import make_model, save_mjcf
+    from jaxsimp.envs import Env, make_env
     from jaxsimp.goals import Subgoal, find_folds, same_folds, subgoals
     from jaxsimp.planning import (
         CEM,
@@ -151,6 +153,7 @@ __all__ = [
     "Encoding",
     "Engine",
     "Ensemble",
+    "Env",
     "Episode",
     "Execution",
     "ExecutionStatus",
@@ -198,6 +201,7 @@ __all__ = [
     "default_algorithm",
     "dynamics",
     "engines",
+    "envs",
     "find_folds",
     "from_mesh",
     "goal_scores",
@@ -207,6 +211,7 @@ __all__ = [
     "load_mesh",
     "load_plan",
     "make_ensemble",
+    "make_env",
     "make_model",
     "make_pickers",
     "make_problem",
@@ -253,6 +258,7 @@ _ROOMS = {
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
     "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",
+    "envs": "Env make_env",
     "goals": "Subgoal find_folds same_folds subgoals",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical CoarseToFinePlanner Descent "
     "Encoding GaussianIndex Joint LocalSearch Optimum Plan Planner Plans RandomShooting "
