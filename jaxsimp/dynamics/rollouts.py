@@ -64,14 +64,12 @@ def rollout_observing(
     """`rollout`, but `observe` takes the state at the end of each action, and the action."""
     state = require_state(state, len(simulation.mass))
     actions = require_actions(actions, len(simulation.mass))
-    run = steps if adjoint else plain_steps
 
-    def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
-        motion = _motion(simulation, pickers, moving, action)
-        moving = run(simulation, moving, motion, speed_profile(pickers.steps))
+    def one(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
+        moving = act(simulation, pickers, moving, action, adjoint=adjoint)
         return moving, observe(end(simulation, moving), action)
 
-    moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
+    moving, observations = jax.lax.scan(one, begin(simulation, state), actions)
     return end(simulation, moving), observations
 
 
@@ -100,7 +98,7 @@ def rollout_in_frames(
     shares = speed_profile(pickers.steps)
     whole = pickers.steps // stride * stride
 
-    def act(moving: Moving, action: Actions) -> tuple[Moving, Float[Array, "frames N 3"]]:
+    def one(moving: Moving, action: Actions) -> tuple[Moving, Float[Array, "frames N 3"]]:
         motion = _motion(simulation, pickers, moving, action)
 
         def frame(
@@ -115,7 +113,21 @@ def rollout_in_frames(
             positions = jnp.concatenate([positions, last[None]])
         return moving, positions
 
-    return jax.lax.scan(act, begin(simulation, state), actions)[1]
+    return jax.lax.scan(one, begin(simulation, state), actions)[1]
+
+
+def act(
+    simulation: Simulation,
+    pickers: Pickers,
+    moving: Moving,
+    action: Actions,
+    *,
+    adjoint: bool = True,
+) -> Moving:
+    """The time steps of one action, shapes (G,) and (G, 3); see `rollout`."""
+    motion = _motion(simulation, pickers, moving, action)
+    run = steps if adjoint else plain_steps
+    return run(simulation, moving, motion, speed_profile(pickers.steps))
 
 
 def settle(simulation: Simulation, state: State, num_steps: int) -> State:
