@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsimp import goals, records
+from jaxsimp import goals, records, viz
 from jaxsimp.bodies import Body
 from jaxsimp.checks import require_choice, require_seed
 from jaxsimp.dynamics import Actions, Obstacle, Pinch, Table
@@ -110,8 +110,27 @@ class GoalPlan:
             self.actions,
             self.execution,
             engine=self.engine,
-            found={"seed": self.seed, "key_points": self.key_points.particles.tolist()},
+            found={
+                "seed": self.seed,
+                "key_points": self.key_points.particles.tolist(),
+                "costs": np.asarray(self.search.optimum.best_costs, float).tolist(),
+            },
         )
+
+    def animate(self, path: str | Path) -> None:
+        """Write the plan as a page that moves, see `jaxsimp.animate`.
+
+        Raises:
+            OSError: if the file cannot be written.
+        """
+        scene = viz.make_scene(
+            self.task,
+            self.episode,
+            self.actions,
+            key_points=self.key_points,
+            costs=self.search.optimum.best_costs,
+        )
+        viz.animate(path, scene)
 
 
 @dataclass(frozen=True, eq=False)

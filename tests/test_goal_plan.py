@@ -40,7 +40,12 @@ def test_a_plan_is_scored_saved_and_verified(tmp_path):
     plan.save(path)
     saved = js.load_plan(path)
     np.testing.assert_array_equal(saved.actions.displacement, plan.actions.displacement)
-    assert saved.about["found"] == {"seed": 1, "key_points": [0, 6, 10]}
+    found = saved.about["found"]
+    assert found["seed"] == 1
+    assert found["key_points"] == [0, 6, 10]
+    np.testing.assert_array_equal(found["costs"], plan.search.optimum.best_costs)
+    plan.animate(tmp_path / "plan.html")
+    assert "<canvas" in (tmp_path / "plan.html").read_text()
     again = Planner(saved.task()).execute(saved.episode, saved.actions)
     assert again.score == pytest.approx(plan.score, abs=1e-6)
     replayed = plan.verify("fast")

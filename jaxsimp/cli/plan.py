@@ -28,7 +28,7 @@ FAILED = 1
 XYZ = tuple[float, float, float]
 ROWS_FILE, PLANS_FOLDER = "plans.jsonl", "plans"
 PLAN_FILE, RESULT_FILE, REPORT_FILE = "plan.npz", "result.json", "report.md"
-FIGURE_FILE, MODEL_FILE = "plan.png", "key_points.png"
+FIGURE_FILE, MODEL_FILE, PAGE_FILE = "plan.png", "key_points.png", "plan.html"
 FIELDS = ("score", "success", "rollouts", "seconds", "compile_seconds", "environment")
 """Fields of a row that the report reads."""
 
@@ -276,7 +276,7 @@ def write_result(
     """Replay the best plan, write plan, figures and report, and return the result."""
     from shutil import copyfile
 
-    from jaxsimp import records
+    from jaxsimp import records, viz
 
     saved = records.load_plan(folder / plan_file(best["seed"]))
     with records.whole_file(folder / PLAN_FILE) as part:
@@ -295,9 +295,11 @@ def write_result(
         replayed = _replayed(planner, saved)
         executions["carried out in MuJoCo"] = replayed.positions, replayed.score
         result["mujoco_full_score"] = replayed.score if math.isfinite(replayed.score) else None
-    result |= {"plan": str(folder / PLAN_FILE), "figure": str(folder / FIGURE_FILE)}
+    files = {"plan": PLAN_FILE, "animation": PAGE_FILE, "figure": FIGURE_FILE}
+    result |= {name: str(folder / file) for name, file in files.items()}
     result["environment"] = best["environment"]
     save_figures(planner, executions, folder)
+    viz.animate(folder / PAGE_FILE, viz.scene_of_plan(saved, title=planner.task.name))
     records.write_json(folder / RESULT_FILE, result)
     records.write_text(folder / REPORT_FILE, report(planner, saved, result, rows))
     return result
@@ -352,6 +354,8 @@ def report(planner: "GoalPlanner", saved: "jaxsimp.SavedPlan", result: Row, rows
             "",
             "The score is `(c_0 - c) / c_0` of the settled state, with its cost `c` and that of "
             "the start, `c_0`: 1 at the goal.",
+            "",
+            f"Open [{PAGE_FILE}]({PAGE_FILE}) in a browser to see it move.",
             "",
             f"![Execution of the plan]({FIGURE_FILE})",
             "",

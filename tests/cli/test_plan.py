@@ -42,6 +42,8 @@ def test_a_goal_becomes_a_folder_with_plan_report_and_figures(tmp_path, capsys):
     assert saved.about["score"] == result["score"]
     for name in ("plan.png", "key_points.png"):
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    assert (folder / "plan.html").read_text().startswith("<!doctype html>")
+    assert result["animation"] == "l-plan/plan.html"
     report = (folder / "report.md").read_text()
     assert f"| score of the best plan | {result['score']:.3f} |" in report
     assert "l-plan/report.md" in capsys.readouterr().out
