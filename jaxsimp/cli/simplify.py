@@ -36,9 +36,9 @@ class Options:
     edge lengths of the goal: accurate to about 1 % where creases lie along edges of the
     triangles, otherwise too short by up to a triangle at each crease.
 
-    With --body a goal may also be a mesh file, whose points are the body's, in its order, or an
-    .npy file of positions. Coordinates are in metres with z up: --scale 0.001 takes files in
-    millimetres, --up y files in which y points up.
+    With --body a goal may also be a mesh file or an .npy file of positions, and its points may be
+    others than the body's particles, or in another order: they are registered. Coordinates are in
+    metres with z up: --scale 0.001 takes files in millimetres, --up y files in which y points up.
     Goals of one body are one batch: give --body, or the same rest and faces.
 
     --lower, --upper, --above-table, --fixed-ends and --max-stretch limit the models of ropes
@@ -188,10 +188,12 @@ def simplified(options: Options) -> list[SimplifiedGoal]:
     scale, up = options.scale, options.up
     with warnings.catch_warnings(record=True) as hints:
         warnings.simplefilter("always")
-        body = load_body(options.body, scale=scale, up=up) if options.body else None
-    for hint in hints:
-        Console(stderr=True).print(f"hint: {hint.message}", markup=False, soft_wrap=True)
-    loaded = [load_goal(path, body, scale=scale, up=up or "z") for path in options.goals]
+        try:
+            body = load_body(options.body, scale=scale, up=up) if options.body else None
+            loaded = [load_goal(path, body, scale=scale, up=up or "z") for path in options.goals]
+        finally:  # a hint may say why what follows is refused
+            for hint in hints:
+                Console(stderr=True).print(f"hint: {hint.message}", markup=False, soft_wrap=True)
     # Files with equal body definitions are goals of one body.
     batches: dict[tuple[bytes, bytes], list[int]] = {}
     for index, (made, _) in enumerate(loaded):

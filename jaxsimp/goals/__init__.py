@@ -1,8 +1,9 @@
 """Goals: the final position of every particle of a body.
 
 A goal is an array of positions, shape (N, 3), metres, z up, the table at z = 0. The functions
-here make goals of ropes, cloths and garments; `check_goal` checks any other goal, and `load_goal`
-reads and checks a goal in a file; `find_folds` and `subgoals` find the folds of a folded goal.
+here make goals of ropes, cloths and garments; `check_goal` checks any other goal, `load_goal`
+reads and checks a goal in a file, and `register` finds the particles in one of other points;
+`find_folds` and `subgoals` find the folds of a folded goal.
 """
 
 from jaxsimp.goals.check import as_goal, check_goal
@@ -16,6 +17,7 @@ from jaxsimp.goals.folds import (
     sleeves_in,
 )
 from jaxsimp.goals.placement import flat_at
+from jaxsimp.goals.registration import Registration, register
 from jaxsimp.goals.shapes import (
     Positions,
     crossed_triangle,
@@ -31,6 +33,7 @@ from jaxsimp.goals.unfolding import Subgoal, find_folds, same_folds, subgoals, u
 __all__ = [
     "Fold",
     "Positions",
+    "Registration",
     "Subgoal",
     "as_goal",
     "check_goal",
@@ -47,6 +50,7 @@ __all__ = [
     "load_goal",
     "polyline",
     "rectangle_folds",
+    "register",
     "same_folds",
     "sleeves_in",
     "straight",

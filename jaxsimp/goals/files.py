@@ -1,5 +1,6 @@
 """Goals from files: arrays of positions, or meshes whose points are the body's particles."""
 
+import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,9 +14,10 @@ from jaxsimp.bodies import MATERIALS, Body, from_mesh, rope_along
 from jaxsimp.bodies.mesh_files import load_mesh, read_file, read_mesh
 from jaxsimp.bodies.meshes import z_up
 from jaxsimp.bodies.size import MOST_TRIANGLES, require_scale, require_size
-from jaxsimp.checks import require_shape, require_whole
+from jaxsimp.checks import require_count, require_shape, require_whole
 from jaxsimp.goals.check import MAX_STRETCH, NOISE, check_goal
 from jaxsimp.goals.flatten import flatten
+from jaxsimp.goals.registration import register
 from jaxsimp.goals.shapes import Positions
 
 SPREAD = 8.0
@@ -25,20 +27,36 @@ UNEVEN, NO_ORDER = 1.4, 0.7
 """Longest step over the usual one, and mean step over the mean distance of any two particles: above
 both, particles are in no order. Accordions of a rope reach the second with even steps."""
 
+SHUFFLED = 2.0
+"""Median distance of the body's neighbours, over that at rest, above which points are in another
+order: they are anywhere."""
+MOST_NUMBERS = 40_000_000
+"""Largest array of frames: 320 MB."""
+
 
 class _UnfitError(ValueError):
     """What is wrong with an array of a file."""
 
 
 def load_goal(
-    path: str | Path, body: Body | None = None, *, scale: float = 1.0, up: str = "z"
+    path: str | Path,
+    body: Body | None = None,
+    *,
+    scale: float = 1.0,
+    up: str = "z",
+    frame: int = -1,
+    start: Positions | None = None,
 ) -> tuple[Body, Positions]:
     """A goal from a file, and its body.
 
     An `.npz` file holds `positions`, shape (N, 3), metres, and may hold `rest`, the rest
     coordinates, shape (N, 3), or (N, 2) for a flat body, and `faces`, shape (F, 3). An `.npy` file
-    holds positions. A mesh file (OBJ, PLY, OFF, GLB, ...) holds the positions as its points, in the
-    body's order. Points are not welded, so an STL file, which repeats its points, does not match.
+    holds positions. Positions of several frames have shape (frames, N, 3). A mesh file (OBJ, PLY,
+    OFF, GLB, ...) holds the positions as its points.
+
+    With `body` the points may be others than its particles, or in another order, as those of a
+    scan or of another mesh: they are registered (see `jaxsimp.goals.register`), and a warning says
+    how well they fit.
 
     Without `body` an `.npz` file defines the body, with default physics. With `faces` it is
     `from_mesh(rest, faces)`; without `rest` it is flat at rest, with the edge lengths of the goal
@@ -52,28 +70,65 @@ def load_goal(
         body: body of the goal.
         scale: metres in one unit of the file: 0.001 for millimetres.
         up: axis of the file that points up: "z", "y" or "x".
+        frame: which of several frames, counted from 0, or from the end below 0; the last by
+            default.
+        start: positions at the start, shape (N, 3), metres, which decide between ways to register
+            that fit as well.
 
     Raises:
-        ValueError: if the file cannot be read or lacks an array, or if the body that it defines
-            or the goal is invalid (see `check_goal`).
+        ValueError: if the file cannot be read or lacks an array or the frame, if the body that it
+            defines or the goal is invalid (see `check_goal`), or its points cannot be registered.
     """
     with _naming(path):
-        members = ("positions", "rest", "faces") if body is None else ("positions",)
-        arrays = _scaled(_read(path, members), scale, up)
+        members = ("positions", "rest", "faces") if body is None else ("positions", "faces")
+        arrays = _read(path, members)
+        arrays["positions"] = _one_frame(arrays["positions"], frame)
+        arrays = _scaled(arrays, scale, up)
         positions = arrays["positions"]
-        if body is None and not _holds_arrays(path):
+        if body is not None:
+            if _are_particles(body, positions):
+                return body, check_goal(body, positions)
+            return body, _registered(path, body, arrays, start)
+        if not _holds_arrays(path):
             raise ValueError(
                 "a mesh does not say how it is at rest; give the body too (body=, or --body)"
             )
-        if body is None:
-            return _with_body(positions, arrays)
-        if not _holds_arrays(path) and len(positions) != body.num_particles:
-            raise ValueError(
-                f"it has {len(positions)} points, and the {body.name} has {body.num_particles} "
-                f"particles; a file may repeat points where textures, normals or materials meet, "
-                f"as STL always does: export it as OBJ or PLY, without them"
-            )
-        return body, check_goal(body, positions)
+        return _with_body(positions, arrays)
+
+
+def _one_frame(positions: np.ndarray, frame: int) -> np.ndarray:
+    """The positions of a frame, if there are several."""
+    if positions.ndim != 3:
+        return positions
+    count = len(positions)
+    require_count("the number of frames", count, 1)
+    return positions[require_count("frame", frame, -count, count - 1)]
+
+
+def _are_particles(body: Body, positions: np.ndarray) -> bool:
+    """Whether there is a point for each particle, and neighbours of the body are not anywhere."""
+    if len(positions) != body.num_particles:
+        return False
+    first, second = body.springs[body.families == 0].T
+    length = np.linalg.norm(positions[second] - positions[first], axis=1)
+    is_large = np.ptp(positions, axis=0).max() > MAX_STRETCH * body.size
+    rest = body.rest_length[body.families == 0]
+    return bool(is_large or np.median(length / rest) <= SHUFFLED)
+
+
+def _registered(
+    path: str | Path, body: Body, arrays: dict[str, np.ndarray], start: Positions | None
+) -> Positions:
+    """The goal of a file whose points are not the body's particles, with a word of it."""
+    points = arrays["positions"]
+    found = register(body, points, arrays.get("faces"), start=start)
+    warnings.warn(
+        f"{path}: its {len(points)} points are not the {body.num_particles} particles of the "
+        f"{body.name} in their order, and were registered to them, within {found.error:.2g} m; "
+        f"{found.num_alike} ways fit as well, and the nearest to the start was taken",
+        stacklevel=4,
+    )
+    return found.positions
 
 
 def load_body(path: str | Path, *, scale: float = 1.0, up: str | None = None) -> Body:
@@ -118,7 +173,7 @@ def _read(path: str | Path, members: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Those arrays of a file that it has; the first is needed."""
     needed = members[0]
     if not _holds_arrays(path):
-        return {needed: read_mesh(path)[0]}
+        return dict(zip((needed, "faces"), read_mesh(path), strict=True))
     remedy = f"an .npz file, written with np.savez(path, {needed}={needed})"
     data = BytesIO(read_file(path, remedy))
     if Path(path).suffix.lower() == ".npy":
@@ -159,7 +214,11 @@ def _read_array(name: str, file: Any) -> np.ndarray:
     if dtype.kind not in "fiu":
         raise _UnfitError(f"{name} is of {dtype}; give an array of real numbers")
     count = int(np.prod(shape, dtype=object))
-    if count > 3 * MOST_TRIANGLES:
+    if count > MOST_NUMBERS:
+        raise _UnfitError(
+            f"{name} has shape {shape}; {MOST_NUMBERS} numbers are the limit: give fewer frames"
+        )
+    if int(np.prod(shape[-2:], dtype=object)) > 3 * MOST_TRIANGLES:
         raise _UnfitError(
             f"{name} has shape {shape}; a body has {MOST_TRIANGLES // 2} particles at most: "
             f"give fewer"

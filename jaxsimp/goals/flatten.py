@@ -55,25 +55,55 @@ def flatten(positions: Positions, faces: Faces) -> Float[np.ndarray, "N 2"]:
     edges = _edges_of_disc(faces, len(positions))
     _check_extent(positions)
     lengths = np.linalg.norm(positions[edges[:, 1]] - positions[edges[:, 0]], axis=1)
-    usual = float(np.median(lengths))
-    stages = [_scaled_distances(len(positions), edges, lengths)]
-    for scale in SCALES:
-        stages.append(_fit_lengths(stages[-1], edges, lengths, scale * usual))
-    flat = np.linalg.norm(stages[1][edges[:, 1]] - stages[1][edges[:, 0]], axis=1)
-    misfit = float(np.median(np.abs(flat - lengths))) / usual
+    stages = lay_out(edges, lengths, len(positions))
+    misfit = median_misfit(stages[0], edges, lengths)
     if misfit > MISFIT:
         raise ValueError(
             f"laid flat, its edges change by {misfit:.1%} in the median; {MISFIT:.0%} is the limit "
             f"for a sheet that is flat at rest. Add rest, or give the body"
         )
     # A stage with a small scale may turn slivers over that an earlier stage did not.
-    lying = [points for points in stages[1:] if not _num_turned(points, faces)]
+    lying = [points for points in stages if not _num_turned(points, faces)]
     if not lying:
         raise ValueError(
             f"it cannot be laid flat: {_num_turned(stages[-1], faces)} pairs of neighbouring "
             f"triangles would cover each other; add rest, or give the body"
         )
     return _upright(lying[-1], faces)
+
+
+def lay_out(
+    edges: Int[np.ndarray, "E 2"],
+    lengths: Float[np.ndarray, " E"],
+    num_points: int,
+    first: Float[np.ndarray, "N 2"] | None = None,
+) -> list[Float[np.ndarray, "N 2"]]:
+    """Points in the plane with given distances of neighbours: one layout for each of `SCALES`.
+
+    Args:
+        edges: pairs of neighbours, which connect all points, shape (E, 2).
+        lengths: their distances, shape (E,), metres.
+        num_points: number of points, N.
+        first: a layout to start from, shape (N, 2), metres; by default that of the distances
+            along the edges.
+    """
+    usual = float(np.median(lengths))
+    points = _scaled_distances(num_points, edges, lengths) if first is None else first
+    stages = []
+    for scale in SCALES:
+        points = _fit_lengths(points, edges, lengths, scale * usual)
+        stages.append(points)
+    return stages
+
+
+def median_misfit(
+    points: Float[np.ndarray, "N 2"],
+    edges: Int[np.ndarray, "E 2"],
+    lengths: Float[np.ndarray, " E"],
+) -> float:
+    """Median difference of the distances in a layout from those given, over the median edge."""
+    flat = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
+    return float(np.median(np.abs(flat - lengths)) / np.median(lengths))
 
 
 def _edges_of_disc(faces: np.ndarray, num_points: int) -> Int[np.ndarray, "E 2"]:

@@ -268,17 +268,43 @@ def test_a_file_that_defines_no_body_and_goal_is_refused(arrays, message, tmp_pa
 
 def test_a_goal_of_another_body_is_refused(tmp_path):
     path = save(tmp_path / "goal.npz", positions=FOLDED)
-    with pytest.raises(
-        ValueError, match=r"goal\.npz: the goal has shape \(30, 3\); give shape \(41"
-    ):
+    with pytest.raises(ValueError, match=r"goal\.npz: the curve through the points"):
         goals.load_goal(path, rope())
+    with pytest.raises(ValueError, match=r"goal\.npz: laid flat, .* beyond the T-shirt"):
+        goals.load_goal(path, SHIRT.body)
+
+
+def test_a_mesh_that_repeats_its_points_is_registered(tmp_path):
     stl = tmp_path / "goal.stl"
     trimesh.Trimesh(FOLDED, CLOTH.faces, process=False).export(stl)
-    with pytest.raises(
-        ValueError,
-        match=r"goal\.stl: it has 120 points, and the cloth has 30 particles",
-    ):
-        goals.load_goal(stl, CLOTH)
+    with pytest.warns(UserWarning, match=r"its 120 points are not the 30 particles of the cloth"):
+        _, goal = goals.load_goal(stl, CLOTH, start=FOLDED)
+    np.testing.assert_allclose(goal, FOLDED, atol=1e-6)  # float32
+
+
+def test_an_unordered_cloud_in_millimetres_with_y_up_is_registered(tmp_path):
+    bent = goals.flat(CLOTH)
+    bent[:, 2] += 0.02 * np.cos(bent[:, 0] / 0.2)
+    order = np.random.default_rng(0).permutation(len(bent))
+    y_up = 1e3 * bent[order][:, [0, 2, 1]] * [1, 1, -1]
+    np.save(tmp_path / "goal.npy", y_up)
+    with pytest.warns(UserWarning, match="were registered to them, within .* 4 ways fit"):
+        _, goal = goals.load_goal(tmp_path / "goal.npy", CLOTH, scale=1e-3, up="y", start=bent)
+    np.testing.assert_allclose(goal, bent, atol=1e-12)
+
+
+def test_a_frame_of_several_is_chosen(tmp_path):
+    frames = np.stack([goals.flat(CLOTH), goals.flat(CLOTH) + 0.01, FOLDED])
+    np.save(tmp_path / "frames.npy", frames)
+    np.testing.assert_array_equal(goals.load_goal(tmp_path / "frames.npy", CLOTH)[1], FOLDED)
+    for frame in (0, 1, -3):
+        _, goal = goals.load_goal(tmp_path / "frames.npy", CLOTH, frame=frame)
+        np.testing.assert_array_equal(goal, frames[frame])
+    with pytest.raises(ValueError, match="frame is 3; give a whole number from -3 to 2"):
+        goals.load_goal(tmp_path / "frames.npy", CLOTH, frame=3)
+    np.save(tmp_path / "none.npy", frames[:0])
+    with pytest.raises(ValueError, match="the number of frames is 0"):
+        goals.load_goal(tmp_path / "none.npy", CLOTH)
 
 
 def test_a_mesh_file_alone_is_no_goal(tmp_path):
