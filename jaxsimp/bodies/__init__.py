@@ -6,7 +6,8 @@ from jaxsimp.bodies.garments import Garment, skirt, t_shirt, towel, trousers
 from jaxsimp.bodies.material import MATERIALS, Material
 from jaxsimp.bodies.mesh_files import load_mesh, read_mesh
 from jaxsimp.bodies.meshes import clean_mesh
-from jaxsimp.bodies.outlines import mesh_outline, mesh_symmetric_outline, remesh
+from jaxsimp.bodies.outlines import mesh_outline, mesh_symmetric_outline
+from jaxsimp.bodies.remeshing import remesh
 
 __all__ = [
     "MATERIALS",

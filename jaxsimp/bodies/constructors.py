@@ -145,8 +145,7 @@ def from_mesh(
     modulus times thickness is the sum of both stiffnesses. Out of the plane only bend springs that
     shorten resist: that is of higher order, and weaker in a finer mesh, as in `cloth`.
 
-    Very unequal or slender triangles need a small time step; `jaxsimp.bodies.outlines.remesh`
-    replaces those of a flat mesh.
+    Very unequal or slender triangles need a small time step; `jaxsimp.bodies.remesh` replaces them.
 
     Args:
         points: shape (V, 3), metres over `scale`, z up.

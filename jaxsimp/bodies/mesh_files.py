@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsimp.bodies.meshes import FLAT, Mesh, as_mesh, clean_mesh, z_up
+from jaxsimp.bodies.meshes import FLAT, NARROW, Mesh, as_mesh, clean_mesh, relative_stiffness, z_up
 from jaxsimp.bodies.size import MOST_PARTICLES
 
 MOST_BYTES = 256 * 2**20
@@ -38,6 +38,8 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, up: str | None = None) ->
         up: axis of the file that points up: "z", "y", as in GLB and most OBJ files, or "x"; None
             for "z", with a warning if the mesh is flat and stands on edge.
 
+    Warns of triangles so narrow that they shorten the time step many times.
+
     Raises:
         ValueError: if the file holds no mesh, or one that `clean_mesh` refuses.
     """
@@ -51,6 +53,13 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, up: str | None = None) ->
         warnings.warn(
             f"{path} is flat and stands on edge, {extents[2]:.3g} m high: if y points up in it, "
             f"give up='y' (--up y), otherwise up='z'",
+            stacklevel=2,
+        )
+    if (stiffer := relative_stiffness(points, faces)) > NARROW:
+        warnings.warn(
+            f"{path} has narrow triangles, which make the longest stable time step "
+            f"{stiffer**0.5:.0f} to {stiffer:.0f} times shorter: replace them by "
+            f"jaxsimp.bodies.remesh(points, faces, num_points)",
             stacklevel=2,
         )
     return points, faces

@@ -7,7 +7,7 @@ triangulation. The result is deterministic. (Smoothing made no angle larger.)
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsimp.bodies.meshes import FLAT, Mesh, Points, clean_mesh, face_areas
+from jaxsimp.bodies.meshes import FLAT, Mesh, Points, face_areas
 from jaxsimp.bodies.size import MOST_PARTICLES, require_size
 from jaxsimp.bodies.topology import Faces, boundary_edges, boundary_loops, distinct_edges
 from jaxsimp.checks import require_count, require_rows
@@ -81,36 +81,28 @@ def mesh_symmetric_outline(
     )
 
 
-def remesh(points: Points, faces: Faces, num_points: int) -> Mesh:
-    """A flat mesh meshed again, with a given number of points, horizontal, facing up.
+def refill(points: Points, faces: Faces, num_points: int) -> Mesh | None:
+    """A flat mesh of one outline meshed again, horizontal, facing up; None for any other mesh.
 
     The outline keeps its corners, where it turns by more than 20 degrees; between them the new
     outline follows it within a thousandth of its extent.
 
     Args:
-        points: shape (V, 3), metres.
+        points: points of a clean mesh, shape (V, 3), metres.
         faces: point ids of the triangles, shape (F, 3).
         num_points: number of points, met within `COUNT_TOLERANCE`.
 
     Raises:
-        ValueError: if `clean_mesh` refuses the mesh, if it is not flat, overlaps itself or has
-            holes, or if `mesh_outline` refuses its outline.
+        ValueError: if `mesh_outline` refuses the outline.
     """
-    points, faces = clean_mesh(points, faces)
     flat = _laid_flat(points)
     loops = boundary_loops(faces)
-    if len(loops) != 1:
-        raise ValueError(
-            f"the mesh has {len(loops)} boundaries; only a flat one without holes, with one "
-            f"boundary, can be meshed anew: decimate or subdivide it in a mesh editor"
-        )
+    if flat is None or len(loops) != 1:
+        return None
     outline = flat[loops[0]]
     covered, enclosed = face_areas(points, faces).sum(), abs(_signed_area(outline))
     if not np.isclose(covered, enclosed, rtol=1e-3):
-        raise ValueError(
-            f"the triangles cover {covered:.4g} m2, their outline {enclosed:.4g} m2: the mesh "
-            f"overlaps itself; spread it out"
-        )
+        return None  # it overlaps itself
     return mesh_outline(_simplified(outline), num_points)
 
 
@@ -229,16 +221,12 @@ def _delaunay(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return faces[whole & _inside((a + b + c) / 3, corners)]
 
 
-def _laid_flat(points: np.ndarray) -> np.ndarray:
-    """A flat mesh turned to horizontal by the least angle, shape (V, 2)."""
+def _laid_flat(points: np.ndarray) -> Float[np.ndarray, "V 2"] | None:
+    """A flat mesh turned to horizontal by the least angle, shape (V, 2); None if it is not flat."""
     centred = points - points.mean(axis=0)
     normal = np.linalg.svd(centred, full_matrices=False)[2][2]
-    height, extent = np.ptp(centred @ normal), np.ptp(points, axis=0).max()
-    if height > FLAT * extent:
-        raise ValueError(
-            f"the mesh is {height:.4g} m high across its plane; only a flat one can be meshed "
-            f"anew: decimate or subdivide it in a mesh editor"
-        )
+    if np.ptp(centred @ normal) > FLAT * np.ptp(points, axis=0).max():
+        return None
     leading = normal[::-1][np.flatnonzero(np.abs(normal[::-1]) > 1e-9)[0]]
     normal = normal * np.sign(leading)  # up, otherwise along y or x
     axis = np.cross(normal, [0.0, 0.0, 1.0])

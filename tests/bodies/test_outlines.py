@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsimp.bodies import cloth
 from jaxsimp.bodies.meshes import clean_mesh, face_areas
-from jaxsimp.bodies.outlines import check_outline, mesh_outline, mesh_symmetric_outline, remesh
+from jaxsimp.bodies.outlines import check_outline, mesh_outline, mesh_symmetric_outline
 from jaxsimp.bodies.topology import boundary_edges
 
 SQUARE = np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]])
@@ -123,75 +122,6 @@ def test_a_symmetric_outline_has_a_mesh_that_is_its_mirror_image(y, wide, wanted
 def test_a_half_that_is_none_is_refused(half, message):
     with pytest.raises(ValueError, match=message):
         mesh_symmetric_outline(np.array(half, dtype=float), 100)
-
-
-# --- meshing anew --------------------------------------------------------------------------------
-
-
-@given(seed=st.integers(0, 10**6), wanted=st.integers(100, 400))
-def test_a_flat_mesh_is_meshed_anew_in_any_plane(seed, wanted):
-    rng = np.random.default_rng(seed)
-    points, faces = mesh_outline(ELL, 150)
-    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    found, found_faces = remesh(points @ turn + rng.uniform(-0.5, 0.5, 3), faces, wanted)
-    assert abs(len(found) - wanted) <= 0.1 * wanted
-    np.testing.assert_allclose(face_areas(found, found_faces).sum(), shoelace(ELL), rtol=1e-9)
-    # The corners, as far from each other as they were (the sheet may lie on its other side).
-    distances = np.linalg.norm(found[:6, None] - found[None, :6], axis=2)
-    wanted_distances = np.linalg.norm(ELL[:, None] - ELL[None], axis=2)
-    np.testing.assert_allclose(
-        np.sort(distances.ravel()), np.sort(wanted_distances.ravel()), atol=1e-9
-    )
-
-
-def test_a_horizontal_mesh_stays_in_place():
-    body = cloth((9, 7), (0.4, 0.3))
-    points, _ = remesh(body.rest, body.faces, 200)
-    corners = {tuple(row) for row in points[:4, :2].round(9).tolist()}
-    assert corners == {(a * 0.2, b * 0.15) for a in (-1, 1) for b in (-1, 1)}
-
-
-def test_a_round_outline_is_followed():
-    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    disc = 0.3 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points, faces = remesh(*mesh_outline(disc, 1200), 500)
-    boundary = np.unique(boundary_edges(faces)[0])
-    # A thousandth of the extent of 0.6 m lies between the outline and its polygon.
-    assert len(boundary) < 120
-    assert face_areas(points, faces).sum() > np.pi * (0.3 - 0.0006) ** 2
-    assert abs(len(points) - 500) <= 50
-
-
-def annulus():
-    body = cloth((4, 4))
-    middle = np.abs(body.rest[body.faces].mean(axis=1)[:, :2]).max(axis=1) < 0.05
-    return body.rest, body.faces[~middle]
-
-
-def folded():
-    body = cloth((9, 5))
-    points = body.rest.copy()
-    points[:, 0] = np.abs(points[:, 0]) * (1 + 1e-4)
-    points[:, 2] = np.where(body.rest[:, 0] < 0, 1e-4, 0.0)
-    return points, body.faces
-
-
-def bent():
-    body = cloth((5, 5))
-    return body.rest + np.stack([0 * body.rest[:, 0]] * 2 + [body.rest[:, 0] ** 2], 1), body.faces
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (annulus, "has 2 boundaries; only a flat one without holes"),
-        (folded, "the mesh overlaps itself; spread it out"),
-        (bent, "m high across its plane; only a flat one can be meshed anew"),
-    ],
-)
-def test_remesh_refuses(make, message):
-    with pytest.raises(ValueError, match=message):
-        remesh(*make(), 100)
 
 
 # --- refusals ------------------------------------------------------------------------------------
