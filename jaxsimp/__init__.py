@@ -71,6 +71,7 @@ if TYPE_CHECKING:
         least_radius,
         make_pickers,
         make_simulation,
+        press,
         rollout,
         settle,
         table_with_edge,
@@ -224,6 +225,7 @@ __all__ = [
     "plan",
     "plan_batch",
     "planning",
+    "press",
     "reach",
     "recording_error",
     "records",
@@ -259,8 +261,8 @@ _ROOMS = {
     "calibration": "Calibration CalibrationConfig Recording calibrate recording_error "
     "simulate_recordings",
     "dynamics": "NONE Actions Box Capsule Obstacle Pickers Pinch Plane Simulation Sphere State "
-    "Table at_rest largest_time_step least_radius make_pickers make_simulation rollout settle "
-    "table_with_edge",
+    "Table at_rest largest_time_step least_radius make_pickers make_simulation press rollout "
+    "settle table_with_edge",
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
     "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",

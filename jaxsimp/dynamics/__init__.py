@@ -11,6 +11,7 @@ from jaxsimp.dynamics.contact.obstacles import (
     table_with_edge,
 )
 from jaxsimp.dynamics.pickers import NONE, Actions, Pickers, Pinch, make_pickers
+from jaxsimp.dynamics.pressing import press
 from jaxsimp.dynamics.rollouts import rollout, rollout_observing, settle
 from jaxsimp.dynamics.simulation import (
     Simulation,
@@ -38,6 +39,7 @@ __all__ = [
     "least_radius",
     "make_pickers",
     "make_simulation",
+    "press",
     "rollout",
     "rollout_observing",
     "settle",
