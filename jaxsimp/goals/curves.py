@@ -40,7 +40,8 @@ def along_curve(
     """
     rest = _arc(body.rest)
     limit = NOISE * rest[-1] + body.radius
-    curve = _through(points, body.num_particles, limit)
+    distinct = np.unique(points, axis=0)  # points at one place are no neighbours in a graph
+    curve = _through(distinct, body.num_particles, limit)
     own = _arc(curve)
     error = float(_distances(points, curve).max())
     if error > limit:

@@ -80,20 +80,20 @@ def load_goal(
             defines or the goal is invalid (see `check_goal`), or its points cannot be registered.
     """
     with _naming(path):
-        members = ("positions", "rest", "faces") if body is None else ("positions", "faces")
-        arrays = _read(path, members)
+        members = ("positions", "rest", "faces")
+        arrays = _read(path, members if body is None else members[:1])
         arrays["positions"] = _one_frame(arrays["positions"], frame)
-        arrays = _scaled(arrays, scale, up)
-        positions = arrays["positions"]
+        positions = _scaled({"positions": arrays["positions"]}, scale, up)["positions"]
+        if body is not None and _are_particles(body, positions):
+            return body, check_goal(body, positions)
         if body is not None:
-            if _are_particles(body, positions):
-                return body, check_goal(body, positions)
-            return body, _registered(path, body, arrays, start)
+            faces = _read(path, ("positions", "faces")).get("faces")
+            return body, _registered(path, body, positions, faces, start)
         if not _holds_arrays(path):
             raise ValueError(
                 "a mesh does not say how it is at rest; give the body too (body=, or --body)"
             )
-        return _with_body(positions, arrays)
+        return _with_body(positions, _scaled(arrays, scale, up))
 
 
 def _one_frame(positions: np.ndarray, frame: int) -> np.ndarray:
@@ -117,11 +117,14 @@ def _are_particles(body: Body, positions: np.ndarray) -> bool:
 
 
 def _registered(
-    path: str | Path, body: Body, arrays: dict[str, np.ndarray], start: Positions | None
+    path: str | Path,
+    body: Body,
+    points: np.ndarray,
+    faces: np.ndarray | None,
+    start: Positions | None,
 ) -> Positions:
     """The goal of a file whose points are not the body's particles, with a word of it."""
-    points = arrays["positions"]
-    found = register(body, points, arrays.get("faces"), start=start)
+    found = register(body, points, faces, start=start)
     warnings.warn(
         f"{path}: its {len(points)} points are not the {body.num_particles} particles of the "
         f"{body.name} in their order, and were registered to them, within {found.error:.2g} m; "
@@ -214,14 +217,14 @@ def _read_array(name: str, file: Any) -> np.ndarray:
     if dtype.kind not in "fiu":
         raise _UnfitError(f"{name} is of {dtype}; give an array of real numbers")
     count = int(np.prod(shape, dtype=object))
-    if count > MOST_NUMBERS:
-        raise _UnfitError(
-            f"{name} has shape {shape}; {MOST_NUMBERS} numbers are the limit: give fewer frames"
-        )
     if int(np.prod(shape[-2:], dtype=object)) > 3 * MOST_TRIANGLES:
         raise _UnfitError(
             f"{name} has shape {shape}; a body has {MOST_TRIANGLES // 2} particles at most: "
             f"give fewer"
+        )
+    if count > MOST_NUMBERS:
+        raise _UnfitError(
+            f"{name} has shape {shape}; {MOST_NUMBERS} numbers are the limit: give fewer frames"
         )
     rest = count * dtype.itemsize - (len(header.getvalue()) - header.tell())
     held = header.read() + (file.read(rest) if rest > 0 else b"")

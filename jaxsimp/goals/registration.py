@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from jaxsimp.bodies import Body
-from jaxsimp.bodies.meshes import face_areas
+from jaxsimp.bodies.meshes import WELD, face_areas
 from jaxsimp.bodies.size import require_size
 from jaxsimp.bodies.topology import (
     Faces,
@@ -24,7 +24,7 @@ from jaxsimp.bodies.topology import (
     distinct_edges,
     half_edges,
 )
-from jaxsimp.checks import require_reals, require_rows, require_whole
+from jaxsimp.checks import require_ids, require_reals, require_rows, require_shape
 from jaxsimp.goals.check import NOISE, check_goal
 from jaxsimp.goals.curves import along_curve
 from jaxsimp.goals.flatten import MISFIT, lay_out, median_misfit
@@ -133,6 +133,13 @@ def register(
             f"the goal has {len(points)} points, and the {body.name} {body.num_particles} "
             f"particles; 3 to {MOST_POINTS} points are registered: give more, or leave some out"
         )
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / len(points) ** 0.5
+    least = float(spread[1 if len(body.faces) else 0])
+    if least <= WELD * body.size:
+        raise ValueError(
+            f"the points of the goal lie on a line, or at one place, with a spread of {least:.2g} "
+            f"m; give points of a {body.name} of {body.size:.3g} m"
+        )
     if not len(body.faces):
         found = Registration(*along_curve(body, points, start), num_alike=2)
     else:
@@ -150,7 +157,11 @@ def _register_sheet(
         points = _thinned(points, int(THINNED * body.num_particles))
         edges = _neighbours(points)
     else:
-        points, faces = _one_piece(points, require_whole("faces", faces))
+        faces = require_ids("a triangle", faces, len(points), "points")
+        require_shape("faces", faces, ("F", 3), "a row of three points for each triangle")
+        if not len(faces):
+            raise ValueError("there are no faces; give triangles, or None for a cloud of points")
+        points, faces = _one_piece(points, faces)
         edges = distinct_edges(half_edges(faces)[0])[0]
     layout = _laid_out(body, points, edges, faces)
     sheet = _Sheet(layout, _covered(layout, edges) if faces is None else faces)

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth, rope
 from jaxsimp.bodies.garments import skirt, t_shirt, towel, trousers
+from jaxsimp.dynamics.contact.settings import make_self_contact
 
 # Float64 coordinates of about 1 m, a few operations each.
 ROUNDING = 1e-12
@@ -299,3 +301,54 @@ def test_a_garment_without_the_parts_is_refused(folds, lacks):
         ValueError, match=f"the skirt has no {lacks}; it has middle_waist, right_waist"
     ):
         folds(skirt(num_particles=100))
+
+
+# --- what lies in layers -------------------------------------------------------------------------
+
+
+def touching(body: Body, positions: np.ndarray) -> np.ndarray:
+    """Pairs of particles at about one place that are not adjacent along the body."""
+    reach = 0.5 * np.median(body.rest_length[body.families == 0])
+    pairs = cKDTree(positions[:, :2]).query_pairs(reach, output_type="ndarray")
+    return pairs[make_self_contact(body, 1e-4).may_touch[tuple(pairs.T)]]
+
+
+@pytest.mark.parametrize("make", [t_shirt, trousers])
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("angle", [0.0, 0.1])
+def test_front_and_back_are_folded_together(make, times, angle):
+    """All layers of one side come to lie on the other, in reversed order, a thickness apart."""
+    body = make(num_particles=400, sheets=2).body
+    before = goals.flat(body)
+    middle = np.array([0.0, np.ptp(before[:, 1]) * -0.02])
+    for turn in range(times):
+        direction = np.array([np.cos(angle + turn * np.pi / 2), np.sin(angle + turn * np.pi / 2)])
+        after = goals.fold(body, before, middle, direction)
+        left = (before[:, :2] - middle) @ np.array([-direction[1], direction[0]]) > 0
+        first, second = touching(body, before).T
+        both = left[first] & left[second]
+        rose = (before[:, 2][first] - before[:, 2][second])[both]
+        np.testing.assert_allclose(
+            (after[:, 2][first] - after[:, 2][second])[both], -rose, atol=ROUNDING
+        )
+        pairs = touching(body, after)
+        apart = np.abs(np.subtract(*after[pairs, 2].T))
+        assert apart.min() > 0.99 * body.material.thickness
+        moved, still = pairs[left[pairs[:, 0]] != left[pairs[:, 1]]].T
+        upper = np.where(left[moved], moved, still)
+        lower = np.where(left[moved], still, moved)
+        assert (after[upper, 2] > after[lower, 2]).all()
+        before = after
+    layers = 2 * 2**times
+    assert np.ptp(after[:, 2]) <= (layers - 1 + 1e-9) * body.material.thickness
+
+
+def test_edges_of_layers_keep_their_lengths_but_across_creases():
+    body = t_shirt(num_particles=400, sheets=2).body
+    folded = goals.fold(body, goals.flat(body), np.zeros(2), np.array([1.0, 0.0]))
+    first, second = body.springs[body.families == 0].T
+    length = np.linalg.norm(folded[second] - folded[first], axis=1)
+    crosses = body.rest[first, 1] * body.rest[second, 1] <= 0
+    # Where the front rises from the seam, by half a thickness in a row: 1 %.
+    ratio = length / body.rest_length[body.families == 0]
+    assert np.abs(ratio[~crosses] - 1).max() < 0.02

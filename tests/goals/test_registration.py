@@ -178,6 +178,10 @@ FACES = OTHER[1]
         (CLOTH, OTHER[0] * 1e3, None, r"is 300 m; .* scale=0\.001"),
         (CLOTH, OTHER[0] * 1.3, FACES, "the cloth is only .* m long between them"),
         (CLOTH, OTHER[0] * [1.0, 0.7, 1.0], FACES, "laid flat, the goal reaches .* short by that"),
+        (CLOTH, OTHER[0] * [1.0, 0.0, 1.0], None, "lie on a line, .* with a spread of .* m"),
+        (ROPE, OTHER[0] * 0.0, None, "at one place, with a spread of 0 m; give points of a rope"),
+        (CLOTH, OTHER[0], FACES[:0], "there are no faces; give triangles, or None for a cloud"),
+        (CLOTH, OTHER[0], FACES + 300, "a triangle names"),
         (CLOTH, np.concatenate([OTHER[0], OTHER[0] + 1.0]), None, "are in 2 pieces"),
         (TWO_SHEETS, OTHER[0], FACES, "the T-shirt has several layers at rest"),
         (ROPE, ROPE.rest * 0.8, None, "is 0.4 m long, and the rope 0.5 m; 0.9 to 1.2 of that"),
@@ -187,6 +191,12 @@ FACES = OTHER[1]
 def test_what_does_not_fit_is_refused(body, points, faces, message):
     with pytest.raises(ValueError, match=message):
         register(body, points, faces)
+
+
+def test_points_that_are_there_twice_do_no_harm():
+    goal = goals.letter(ROPE, "S")
+    found = register(ROPE, np.concatenate([goal, goal[::3]]), start=goal)
+    np.testing.assert_array_equal(found.positions, goal)
 
 
 def test_a_closed_mesh_is_no_goal_of_a_sheet():

@@ -99,6 +99,13 @@ def _check_rope(result: Any, body: js.Body = ROPE, **_: Any) -> None:
     assert steps.max() < 1.3 * body.size, "a step is longer than the rope"
 
 
+def _check_registered(result: Any, body: js.Body, **_: Any) -> None:
+    _check_positions(result.positions)
+    assert result.positions.shape == body.rest.shape, f"shape {result.positions.shape}"
+    assert np.isfinite(result.error), "the error is not finite"
+    assert result.num_alike >= 1, "no way"
+
+
 def _check_fold(result: Any, body: js.Body, positions: Any = None, **_: Any) -> None:
     _check_positions(result)
     assert result.shape == body.rest.shape, f"shape {result.shape}"
@@ -250,8 +257,8 @@ def _check_goal_file(result: Any, path: FileCase) -> None:
 
 
 def _is_goal_of_body(path: FileCase) -> bool | None:
-    if path.source in ("mesh .stl", "unordered cloud"):
-        return False if path.source == "mesh .stl" and not path.damage else None
+    if path.source in ("mesh .stl", "unordered cloud"):  # registered, if they can be
+        return True if path.source == "mesh .stl" and not path.damage else None
     if path.source == "mesh .glb":
         return None if path.damage else _is_whole(path, MESH_FILES)
     return _is_whole(path, (*MESH_FILES, GROUPED, *WHOLE[2:]))
@@ -371,6 +378,39 @@ DOORS = (
         {"positions": array(goals_of(ROPE))},
         lambda positions: both(is_array(positions, (9, 3)), None),
         _check_positions,
+    ),
+    Door(
+        "goals.register.cloud",
+        lambda points, start=None: goals.register(CLOTH, points, start=start),
+        {
+            "points": array(goals_of(CLOTH)),
+            "start": array(st.just(goals.flat(CLOTH)), optional=True),
+        },
+        lambda points, start=None: both(
+            is_array(points, (None, 3)), start is None or is_array(start, (25, 3)), None
+        ),
+        lambda result, **_: _check_registered(result, CLOTH),
+        weight=5,
+    ),
+    Door(
+        "goals.register.mesh",
+        lambda points, faces: goals.register(CLOTH, points, faces),
+        {"points": array(st.just(goals.flat(CLOTH))), "faces": array(st.just(CLOTH.faces))},
+        lambda points, faces: both(
+            is_array(points, (None, 3)),
+            faces is None or is_array(faces, (None, 3), "iu"),
+            None,
+        ),
+        lambda result, **_: _check_registered(result, CLOTH),
+        weight=5,
+    ),
+    Door(
+        "goals.register.rope",
+        lambda points: goals.register(ROPE, points),
+        {"points": array(goals_of(ROPE))},
+        lambda points: both(is_array(points, (None, 3)), None),
+        lambda result, **_: _check_registered(result, ROPE),
+        weight=5,
     ),
     Door(
         "goals.fold",
