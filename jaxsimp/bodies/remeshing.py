@@ -88,9 +88,7 @@ def _is_clean(points: np.ndarray, faces: np.ndarray) -> bool:
 def _mesh_of_size(mmgpy: ModuleType, points: np.ndarray, faces: np.ndarray, size: float) -> Mesh:
     """A mesh with edges of about a length, metres."""
     mesh = mmgpy.MmgMeshS(points, faces.astype(np.int32))
-    corners = _corners(points, faces)
-    mesh.set_corners(corners)
-    mesh.set_required_vertices(corners)
+    mesh.set_corners(_corners(points, faces))
     # No ridges: a wrinkle is no edge of the shape. A coarse tolerance keeps triangles of one size.
     mesh.remesh(hsiz=size, hausd=size, angle=0, verbose=-1)
     return np.array(mesh.get_vertices()), np.array(mesh.get_triangles(), np.int64)

@@ -221,6 +221,10 @@ def _neighbours(points: np.ndarray) -> Int[np.ndarray, "E 2"]:
 
 def _one_piece(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The points of a mesh's triangles, those of one place joined if it is in pieces otherwise."""
+    whole = (np.diff(np.sort(faces, axis=1), axis=1) > 0).all(axis=1)
+    if not whole.any():
+        raise ValueError(f"each of {len(faces)} triangles names a point twice; give a surface")
+    faces = faces[whole]
     used, faces = np.unique(faces, return_inverse=True)
     points, faces = points[used], faces.reshape(-1, 3)
     if connected_pieces(half_edges(faces)[0], len(points))[0] > 1:
@@ -241,6 +245,8 @@ def _laid_out(
         )
     lengths = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
     first = None if faces is None else _conformal(points, faces)
+    if first is not None and not np.isfinite(first).all():
+        first = None  # of empty triangles
     layout = lay_out(edges, lengths, len(points), first)[-1]
     if faces is None:
         _check_shortcuts(body, layout, edges, lengths)
@@ -276,12 +282,13 @@ def _conformal(points: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 2"
     rim = np.unique(boundary_edges(faces)[0])
     if not len(rim):
         raise ValueError(
-            "the mesh of the goal is closed; a sheet has a boundary: give its points in the order "
-            "of the particles"
+            f"the mesh of the goal is closed, of {len(faces)} triangles; a sheet has a boundary: "
+            f"give its points in the order of the particles"
         )
     far = rim[np.linalg.norm(points[rim] - points[rim[0]], axis=1).argmax()]
     pins = np.array([[0.0, 0.0], [1.0, 0.0]])
-    layout, _ = igl.lscm(points, faces, np.array([rim[0], far]), pins)
+    with np.errstate(all="ignore"):
+        layout, _ = igl.lscm(points, faces, np.array([rim[0], far]), pins)
     flat = _Sheet(layout[:, 0] + 1j * layout[:, 1], faces)
     return layout * np.sqrt(face_areas(points, faces).sum() / np.abs(flat.areas()).sum())
 

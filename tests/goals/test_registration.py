@@ -72,7 +72,7 @@ def test_a_goal_of_other_points_gives_each_particle_its_place(seed, state, is_me
 
 
 def test_a_garment_with_arms_is_laid_out():
-    body, finer = (trousers(num_particles=count).body for count in (300, 500))
+    body, finer = (trousers(num_particles=count).body for count in (300, 1500))
     true = bent(body.rest)
     found = register(body, bent(finer.rest), finer.faces, start=true)
     assert found.num_alike == 2  # its mirror image, turned over
@@ -111,6 +111,14 @@ def test_a_cloud_is_right_or_refused(fraction, gap):
         assert np.abs(found.positions - true).max() < 0.02
 
 
+def test_a_coarse_cloud_whose_layers_are_as_near_as_its_points_is_refused():
+    """40 mm apart, the points 21 mm: laid flat it would have about the outline of the cloth."""
+    fine, coarse = cloth((25, 25)), cloth((15, 15))
+    true, points = (rolled(body.rest, 0.02, 0.02, np.pi) for body in (fine, coarse))
+    with pytest.raises(ValueError, match="layers of the cloth are as near to each other as"):
+        register(fine, points, start=true)
+
+
 # --- ropes ---------------------------------------------------------------------------------------
 
 
@@ -140,7 +148,8 @@ def test_a_rope_lies_along_a_dense_cloud(letter, count, noise):
     points = between(goal, count, rng) + rng.normal(scale=noise, size=(count, 3)) * (noise > 0)
     found = register(ROPE, points, start=goal).positions
     # Averages of points 17 mm apart cut the corners of an M; the rest is spread over its length.
-    assert np.linalg.norm(found - goal, axis=1).max() < ROPE.spacing
+    limit = ROPE.spacing * (1.0 if letter == "M" else 0.35)
+    assert np.linalg.norm(found - goal, axis=1).max() < limit
 
 
 def test_without_a_start_the_first_point_is_at_the_first_end():
@@ -202,5 +211,5 @@ def test_points_that_are_there_twice_do_no_harm():
 def test_a_closed_mesh_is_no_goal_of_a_sheet():
     corners = 0.1 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-    with pytest.raises(ValueError, match="the mesh of the goal is closed; a sheet has a boundary"):
+    with pytest.raises(ValueError, match=r"the mesh of the goal is closed, .*; a sheet has"):
         register(CLOTH, corners, faces)
