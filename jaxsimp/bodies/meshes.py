@@ -160,7 +160,8 @@ def spring_weights(
     heights = 2 * total[inner] / length[inner]
     weight = total[inner] / np.maximum(_lengths(points, ends), heights) ** 2
     across, group, _ = distinct_edges(ends)
-    weight = np.bincount(group, weights=weight, minlength=len(across))
+    # Of no pairs NumPy makes whole numbers.
+    weight = np.bincount(group, weights=weight, minlength=len(across)).astype(float)
     free = ~are_among(across, pairs)
     return (pairs, total / length**2), (across[free], weight[free])
 

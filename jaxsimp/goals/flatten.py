@@ -27,6 +27,8 @@ SCALES = (1.0, 0.3, 0.1)
 """Misfit above which an edge's weight falls, relative to the median edge, for each stage."""
 STEPS = 20
 """Number of steps per stage: half of them suffice on folded cloths and garments."""
+ENOUGH = 1e-6
+"""Step, relative to the longest edge, after which no further one is taken."""
 DAMPING = 1e-3
 """Stiffness that holds each point, relative to an edge: without it a solution may float."""
 MOST_LANDMARKS = 64
@@ -193,7 +195,10 @@ def _fit_lengths(
         J = csc_array((np.hstack([-unit, unit]).ravel(), (rows, ends.ravel())), shape=shape)
         weights = (1 + ((now - lengths) / scale) ** 2) ** -2.0
         normal = csc_array(J.T @ (J * weights[:, None]) + damping)
-        points = points - splu(normal).solve(J.T @ (weights * (now - lengths))).reshape(-1, 2)
+        step = splu(normal).solve(J.T @ (weights * (now - lengths))).reshape(-1, 2)
+        points = points - step
+        if np.abs(step).max() <= ENOUGH * lengths.max():
+            break
     return points
 
 

@@ -7,9 +7,7 @@ McKay, "A method for registration of 3-D shapes", 1992, from many turns); each p
 place of its point of the layout. `jaxsimp.goals.curves` has ropes.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -28,10 +26,12 @@ from jaxsimp.checks import require_ids, require_reals, require_rows, require_sha
 from jaxsimp.goals.check import NOISE, check_goal
 from jaxsimp.goals.curves import along_curve
 from jaxsimp.goals.flatten import MISFIT, lay_out, median_misfit
+from jaxsimp.goals.outline_fit import Sheet, fit_outlines, in_space, outside
 from jaxsimp.goals.shapes import Positions, flat
 
-MOST_POINTS = 20_000
-"""Largest number of points: a layout of so many takes about 10 s."""
+MOST_POINTS, MOST_OF_MESH = 20_000, 6_000
+"""Largest number of points of a cloud, which is averaged, and of a mesh, which is laid out whole:
+that takes 10 s, and in finer ones noise of 1 mm outweighs the edges."""
 MOST_MATCHED = 3000
 """Largest number of points that are matched with as many particles, one by one."""
 NEIGHBOURS = 8
@@ -39,6 +39,8 @@ GAP = 1.7
 """Largest distance of neighbours in a cloud, in median distances."""
 THINNED = 2.0
 """Points for each particle, to which a denser cloud is averaged: that takes its noise away."""
+ALIKE = 0.01
+"""Misfit of outlines, relative to the body's size, above the least, of fits that are as good."""
 CLOUD = 0.02
 """Largest distance between the body and a cloud, relative to the body's size, and besides a quarter
 of the points' spacing: less than `NOISE`, as a corner that touches shows little elsewhere."""
@@ -48,11 +50,6 @@ one: they are of two layers. Noise of 2 mm between points 7 mm apart gives up to
 HOLE = 1.2
 """Largest radius of the circle about a triangle of a cloud's layout, in median distances of
 neighbours: larger ones are gaps."""
-SAMPLES = 240
-TURNS = 24
-STEPS = 24
-ALIKE = 0.01
-"""Misfit of outlines, relative to the body's size, above the least, of fits that are as good."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,34 +67,6 @@ class Registration:
     positions: Positions
     error: float
     num_alike: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Sheet:
-    """A surface in the plane: points x + iy, and triangles."""
-
-    points: Complex[np.ndarray, " V"]
-    faces: Faces
-
-    def outline(self) -> tuple[Complex[np.ndarray, " S"], Complex[np.ndarray, " S"]]:
-        """Points along all boundaries, evenly spaced, and the direction of the boundary there."""
-        starts, ends = self.points[boundary_edges(self.faces)[0].T]
-        length = np.abs(ends - starts)
-        arc = np.concatenate([[0.0], np.cumsum(length)])
-        at = (np.arange(SAMPLES) + 0.5) / SAMPLES * arc[-1]
-        edge = np.searchsorted(arc, at) - 1
-        along = (ends - starts)[edge] / length[edge]
-        return starts[edge] + (at - arc[edge]) * along, along
-
-    def middle(self) -> complex:
-        """Centre of the area."""
-        area, (a, b, c) = self.areas(), self.points[self.faces.T]
-        return complex((area * (a + b + c)).sum() / (3 * area.sum()))
-
-    def areas(self) -> Float[np.ndarray, " F"]:
-        """Areas of the triangles, below zero for those that face down."""
-        a, b, c = self.points[self.faces.T]
-        return ((b - a).conj() * (c - a)).imag / 2
 
 
 def register(
@@ -131,10 +100,12 @@ def register(
     if start is not None:
         why = f"one row for each particle of the {body.name}"
         start = require_reals("start", start, body.rest.shape, why)
-    if not 3 <= len(points) <= MOST_POINTS:
+    most = MOST_POINTS if faces is None else MOST_OF_MESH
+    if not 3 <= len(points) <= most:
         raise ValueError(
             f"the goal has {len(points)} points, and the {body.name} {body.num_particles} "
-            f"particles; 3 to {MOST_POINTS} points are registered: give more, or leave some out"
+            f"particles; 3 to {most} points are registered: give more, or for a fine mesh those of "
+            f"jaxsimp.bodies.remesh"
         )
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / len(points) ** 0.5
     least = float(spread[1 if len(body.faces) else 0])
@@ -167,10 +138,10 @@ def _register_sheet(
         points, faces = _one_piece(points, faces)
         edges = distinct_edges(half_edges(faces)[0])[0]
     layout = _laid_out(body, points, edges, faces)
-    sheet = _Sheet(layout, _covered(layout, edges) if faces is None else faces)
-    ways = _fit_outlines(rest, sheet, ALIKE * body.size)
+    sheet = Sheet(layout, _covered(layout, edges) if faces is None else faces)
+    ways = fit_outlines(rest, sheet, ALIKE * body.size)
     spacing = float(np.median(np.abs(layout[edges[:, 1]] - layout[edges[:, 0]])))
-    error = max(_outside(ways[0], sheet), _outside(layout, _Sheet(ways[0], body.faces)))
+    error = max(outside(ways[0], sheet), outside(layout, Sheet(ways[0], body.faces)))
     limit = NOISE * body.size + spacing / 2
     if is_cloud:
         limit = CLOUD * body.size + spacing / 4
@@ -190,11 +161,11 @@ _REMEDY = (
 )
 
 
-def _at_rest(body: Body) -> _Sheet:
+def _at_rest(body: Body) -> Sheet:
     """The body in the plane, if it is one layer."""
     flat(body)
     rest = body.rest[:, 0] + 1j * body.rest[:, 1]
-    sheet = _Sheet(rest, body.faces)
+    sheet = Sheet(rest, body.faces)
     if (sheet.areas() > 0).any() and (sheet.areas() < 0).any():
         raise ValueError(
             f"the {body.name} has several layers at rest; goals of other points are registered to "
@@ -209,7 +180,7 @@ def _thinned(points: np.ndarray, count: int) -> np.ndarray:
         return points
     from scipy.cluster.vq import kmeans2
 
-    centres, label = kmeans2(points, count, iter=10, minit="++", rng=np.random.default_rng(0))
+    centres, label = kmeans2(points, count, iter=10, minit="points", rng=np.random.default_rng(0))
     return centres[np.bincount(label, minlength=count) > 0]
 
 
@@ -294,7 +265,7 @@ def _conformal(points: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 2"
     pins = np.array([[0.0, 0.0], [1.0, 0.0]])
     with np.errstate(all="ignore"):
         layout, _ = igl.lscm(points, faces, np.array([rim[0], far]), pins)
-    flat = _Sheet(layout[:, 0] + 1j * layout[:, 1], faces)
+    flat = Sheet(layout[:, 0] + 1j * layout[:, 1], faces)
     return layout * np.sqrt(face_areas(points, faces).sum() / np.abs(flat.areas()).sum())
 
 
@@ -306,111 +277,30 @@ def _covered(layout: np.ndarray, edges: np.ndarray) -> Faces:
     faces = Delaunay(flat).simplices.astype(np.int64)
     usual = np.median(np.abs(layout[edges[:, 1]] - layout[edges[:, 0]]))
     sides = np.abs(layout[faces] - layout[np.roll(faces, 1, axis=1)])
-    areas = _Sheet(layout, faces).areas()
+    areas = Sheet(layout, faces).areas()
     around = sides.prod(axis=1) / np.maximum(4 * np.abs(areas), 1e-300)  # radius of the circle
     return np.where((areas < 0)[:, None], faces[:, ::-1], faces)[around <= HOLE * usual]
 
 
-def _fit_outlines(rest: _Sheet, sheet: _Sheet, alike: float) -> list[Complex[np.ndarray, " N"]]:
-    """The body's place in the layout, for each way that fits; the best one first."""
-    fits = []
-    for mirrored in (False, True):
-        own = _Sheet(rest.points.conj() if mirrored else rest.points, rest.faces)
-        fits += list(_fits(own, sheet))
-    fits.sort(key=lambda fit: fit[0])
-    ways: list[np.ndarray] = []
-    for misfit, place in fits:
-        apart = [np.abs(place - other).max() > 10 * alike for other in ways]
-        if misfit <= fits[0][0] + alike and all(apart):
-            ways.append(place)
-    return ways
-
-
-def _fits(own: _Sheet, sheet: _Sheet) -> Iterator[tuple[float, Complex[np.ndarray, " N"]]]:
-    """From each turn: misfit of the outlines, and the body's place."""
-    inner, outer = own.outline(), sheet.outline()
-    here, there = _tree(inner[0]), _tree(outer[0])
-    for angle in 2 * np.pi * np.arange(TURNS) / TURNS:
-        turn = complex(np.exp(1j * angle))
-        shift = sheet.middle() - turn * own.middle()
-        for step in range(STEPS):
-            near, to = _query(there, turn * inner[0] + shift)
-            back, away = _query(here, (outer[0] - shift) / turn)
-            first = np.concatenate([inner[0], inner[0][away]])
-            second = np.concatenate([outer[0][to], outer[0]])
-            along = np.concatenate([outer[1][to], outer[1]])
-            if step < STEPS // 2:
-                turn, shift = _to_points(first, second)
-            else:
-                turn, shift = _to_lines(turn, shift, first, second, along)
-        misfit = np.sqrt(np.mean(np.concatenate([near, abs(turn) * back]) ** 2))
-        yield float(misfit), turn * own.points + shift
-
-
-def _tree(points: np.ndarray) -> Any:
-    from scipy.spatial import cKDTree
-
-    return cKDTree(np.stack([points.real, points.imag], axis=1))
-
-
-def _query(tree: Any, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return tree.query(np.stack([points.real, points.imag], axis=1))
-
-
-def _to_points(first: np.ndarray, second: np.ndarray) -> tuple[complex, complex]:
-    """Turn and shift that lay the first points nearest to the second ones."""
-    middle, target = first.mean(), second.mean()
-    along = complex(np.vdot(first - middle, second - target))
-    turn = along / abs(along)
-    return turn, complex(target - turn * middle)
-
-
-def _to_lines(
-    turn: complex, shift: complex, first: np.ndarray, second: np.ndarray, along: np.ndarray
-) -> tuple[complex, complex]:
-    """Turn, with a change of size, and shift, a step nearer to the lines through second points."""
-    now, normal = turn * first + shift, 1j * along
-    # The change is a factor 1 + a + ib and a shift c + id; its distance from the lines is linear.
-    change = normal.conj()[:, None] * np.stack([now, 1j * now, 0 * now + 1, 0 * now + 1j], axis=1)
-    away = (normal.conj() * (now - second)).real
-    a, b, c, d = np.linalg.lstsq(change.real, -away)[0]
-    factor = 1 + complex(a, b)
-    return factor * turn, factor * shift + complex(c, d)
-
-
-def _in_space(points: np.ndarray) -> Float[np.ndarray, "_ 3"]:
-    return np.stack([points.real, points.imag, np.zeros(len(points))], axis=1)
-
-
-def _outside(points: np.ndarray, sheet: _Sheet) -> float:
-    """Largest distance of points from a surface in the plane."""
-    import igl
-
-    squared, _, _ = igl.point_mesh_squared_distance(
-        _in_space(points), _in_space(sheet.points), sheet.faces
-    )
-    return float(np.sqrt(squared.max()))
-
-
-def _placed(place: np.ndarray, sheet: _Sheet, points: np.ndarray, spacing: float) -> Positions:
+def _placed(place: np.ndarray, sheet: Sheet, points: np.ndarray, spacing: float) -> Positions:
     """Positions of particles from their places in the layout."""
     from scipy.optimize import linear_sum_assignment
     from scipy.spatial.distance import cdist
 
     if len(points) == len(place) <= MOST_MATCHED:
-        apart = cdist(_in_space(place), _in_space(sheet.points))
+        apart = cdist(in_space(place), in_space(sheet.points))
         _, match = linear_sum_assignment(apart**2)
         if apart[np.arange(len(place)), match].max() <= spacing / 2:
             return points[match]  # the points are the particles, in another order
     return _interpolated(place, sheet, points)
 
 
-def _interpolated(place: np.ndarray, sheet: _Sheet, points: np.ndarray) -> Positions:
+def _interpolated(place: np.ndarray, sheet: Sheet, points: np.ndarray) -> Positions:
     """Positions between the points of the goal; beyond its outline the nearest triangle goes on."""
     import igl
 
     _, face, _ = igl.point_mesh_squared_distance(
-        _in_space(place), _in_space(sheet.points), sheet.faces
+        in_space(place), in_space(sheet.points), sheet.faces
     )
     corners = sheet.faces[face]
     a, b, c = sheet.points[corners.T]
