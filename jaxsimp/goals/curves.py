@@ -85,7 +85,7 @@ def _through(points: np.ndarray, count: int, aside: float) -> Float[np.ndarray, 
         return points[_path(points, aside)]
     from scipy.cluster.vq import kmeans2
 
-    centres, label = kmeans2(points, count, iter=20, minit="points", rng=np.random.default_rng(0))
+    centres, label = kmeans2(points, count, iter=20, minit="++", rng=np.random.default_rng(0))
     curve = centres[np.bincount(label, minlength=count) > 0]
     curve = curve[_path(curve, aside)]
     # An average lies inside its points: the ends are half a spacing further out.
