@@ -87,6 +87,7 @@ if TYPE_CHECKING:
         MuJoCo,
         SearchEngine,
         Spread,
+        Trajectory,
         compare_with_mjx,
         goal_scores,
         make_ensemble,
@@ -131,6 +132,7 @@ if TYPE_CHECKING:
         simplify_batch,
     )
     from jaxsimp.tasks import Episode, Task, make_task, reach, register, score, task_names
+    from jaxsimp.viz import Scene, animate, make_scene, scene_of_goal, scene_of_plan
 
     __version__: str
 
@@ -182,6 +184,7 @@ __all__ = [
     "Recording",
     "Reranking",
     "SavedPlan",
+    "Scene",
     "SearchEngine",
     "Sequence",
     "Simulation",
@@ -192,8 +195,10 @@ __all__ = [
     "Subgoal",
     "Table",
     "Task",
+    "Trajectory",
     "Workspace",
     "__version__",
+    "animate",
     "at_rest",
     "bodies",
     "calibrate",
@@ -218,6 +223,7 @@ __all__ = [
     "make_model",
     "make_pickers",
     "make_problem",
+    "make_scene",
     "make_simulation",
     "make_task",
     "optimize",
@@ -235,6 +241,8 @@ __all__ = [
     "same_folds",
     "save_mjcf",
     "save_plan",
+    "scene_of_goal",
+    "scene_of_plan",
     "score",
     "search_on_host",
     "settle",
@@ -262,7 +270,7 @@ _ROOMS = {
     "Table at_rest largest_time_step least_radius make_pickers make_simulation rollout settle "
     "table_with_edge",
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
-    "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
+    "SearchEngine Spread Trajectory compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",
     "goal_plan": "GoalPlan GoalPlanner goal_planner plan plan_batch",
     "goals": "Subgoal find_folds same_folds subgoals",
@@ -273,7 +281,7 @@ _ROOMS = {
     "records": "SavedPlan load_plan save_plan",
     "simplification": "METHODS FitStatus KeyPoints Workspace simplify simplify_batch",
     "tasks": "Episode Task make_task reach register score task_names",
-    "viz": "",
+    "viz": "Scene animate make_scene scene_of_goal scene_of_plan",
 }
 """Names of the face: for each room the names that `jaxsimp` exports directly."""
 

@@ -11,7 +11,7 @@ from jaxsimp.dynamics.contact.obstacles import (
     table_with_edge,
 )
 from jaxsimp.dynamics.pickers import NONE, Actions, Pickers, Pinch, make_pickers
-from jaxsimp.dynamics.rollouts import rollout, rollout_observing, settle
+from jaxsimp.dynamics.rollouts import rollout, rollout_in_frames, rollout_observing, settle
 from jaxsimp.dynamics.simulation import (
     Simulation,
     State,
@@ -39,6 +39,7 @@ __all__ = [
     "make_pickers",
     "make_simulation",
     "rollout",
+    "rollout_in_frames",
     "rollout_observing",
     "settle",
     "table_with_edge",

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxsimp.checks import require_count
 from jaxsimp.dynamics.adjoint import plain_steps, steps
@@ -67,15 +67,55 @@ def rollout_observing(
     run = steps if adjoint else plain_steps
 
     def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
-        position = unpack(simulation, moving[0]).position
-        around = simulation.rest, simulation.obstacles, simulation.radius
-        held, displacement = grasp(pickers, *around, position, action)
-        motion = Motion(held, displacement.T / simulation.time_step)
+        motion = _motion(simulation, pickers, moving, action)
         moving = run(simulation, moving, motion, speed_profile(pickers.steps))
         return moving, observe(end(simulation, moving), action)
 
     moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
     return end(simulation, moving), observations
+
+
+def rollout_in_frames(
+    simulation: Simulation, pickers: Pickers, state: State, actions: Actions, stride: int
+) -> Float[Array, "T frames N 3"]:
+    """Positions during each action of a plan, not only at its end.
+
+    Args:
+        simulation: as for `rollout`.
+        pickers: as for `rollout`.
+        state: as for `rollout`.
+        actions: as for `rollout`.
+        stride: number of time steps from frame to frame. The last frame of an action is its end, so
+            the one before it may be fewer steps away.
+
+    Returns:
+        Positions of the particles, metres, without those at the start; `frames` is the number of
+        steps of an action over `stride`, rounded up.
+
+    Raises:
+        ValueError: if `require_actions` refuses the plan, or `require_state` the state.
+    """
+    state = require_state(state, len(simulation.mass))
+    actions = require_actions(actions, len(simulation.mass))
+    shares = speed_profile(pickers.steps)
+    whole = pickers.steps // stride * stride
+
+    def act(moving: Moving, action: Actions) -> tuple[Moving, Float[Array, "frames N 3"]]:
+        motion = _motion(simulation, pickers, moving, action)
+
+        def frame(
+            moving: Moving, shares: Float[Array, " stride"]
+        ) -> tuple[Moving, Float[Array, "N 3"]]:
+            moving = steps(simulation, moving, motion, shares)
+            return moving, unpack(simulation, moving[0]).position
+
+        moving, positions = jax.lax.scan(frame, moving, shares[:whole].reshape(-1, stride))
+        if whole < pickers.steps:
+            moving, last = frame(moving, shares[whole:])
+            positions = jnp.concatenate([positions, last[None]])
+        return moving, positions
+
+    return jax.lax.scan(act, begin(simulation, state), actions)[1]
 
 
 def settle(simulation: Simulation, state: State, num_steps: int) -> State:
@@ -92,3 +132,11 @@ def settle(simulation: Simulation, state: State, num_steps: int) -> State:
     share = jnp.zeros(num_steps, dtype=drive.dtype)
     moving = steps(simulation, moving, Motion(held, drive), share)
     return end(simulation, moving)
+
+
+def _motion(simulation: Simulation, pickers: Pickers, moving: Moving, action: Actions) -> Motion:
+    """What the pickers hold during an action, and where to."""
+    position = unpack(simulation, moving[0]).position
+    around = simulation.rest, simulation.obstacles, simulation.radius
+    held, displacement = grasp(pickers, *around, position, action)
+    return Motion(held, displacement.T / simulation.time_step)

@@ -16,8 +16,10 @@ from jaxsimp.engines.mujoco import MuJoCo, replay
 from jaxsimp.engines.population import Layout, PopulationMap, default_layout
 from jaxsimp.engines.rollouts import RolloutExecutor, plan_cost, settled_score
 from jaxsimp.engines.springs import MassSprings, spring_chunk_size
+from jaxsimp.engines.trajectory import FRAMES_PER_SECOND, Recorder, Trajectory
 
 __all__ = [
+    "FRAMES_PER_SECOND",
     "MJX",
     "Engine",
     "Ensemble",
@@ -30,9 +32,11 @@ __all__ = [
     "MuJoCo",
     "Observe",
     "PopulationMap",
+    "Recorder",
     "RolloutExecutor",
     "SearchEngine",
     "Spread",
+    "Trajectory",
     "compare_with_mjx",
     "default_layout",
     "goal_scores",

@@ -9,7 +9,8 @@ from jaxsimp.checks import require_flag
 from jaxsimp.dynamics import Actions, Pickers, Simulation, State, rollout_observing
 from jaxsimp.engines.engine import Executor, Observe
 from jaxsimp.engines.rollouts import RolloutExecutor
-from jaxsimp.tasks import Task
+from jaxsimp.engines.trajectory import FRAMES_PER_SECOND, Trajectory, rollout_trajectory
+from jaxsimp.tasks import Episode, Task
 
 CHUNK_SIZE = 8
 """Samples per chunk on a CPU, for any number of workers: the chunk size determines rounding, so
@@ -53,6 +54,16 @@ class MassSprings:
     def chunk_size(self, physics: Physics) -> int:
         """See `CHUNK_SIZE`."""
         return spring_chunk_size(physics[0])
+
+    def trajectory(
+        self,
+        task: Task,
+        episode: Episode,
+        actions: Actions,
+        frames_per_second: float = FRAMES_PER_SECOND,
+    ) -> Trajectory:
+        """See `Recorder.trajectory`."""
+        return rollout_trajectory(self.physics(task), task, episode, actions, frames_per_second)
 
     def executor(self, task: Task) -> Executor:
         """See `Engine.executor`."""

@@ -262,7 +262,7 @@ def test_files_of_the_same_name_both_appear(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [str(path.relative_to(tmp_path)) for path in paths]
     drawn = []
-    monkeypatch.setattr("jaxsimp.viz._title", lambda name: drawn.append(name) or name)
+    monkeypatch.setattr("jaxsimp.viz.figures._title", lambda name: drawn.append(name) or name)
     assert command(*names, "--figure", "all.png", "--json", "all.json") == 0
     assert drawn == names
     told = capsys.readouterr().out

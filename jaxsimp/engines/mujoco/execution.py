@@ -23,6 +23,12 @@ from jaxsimp.dynamics.pickers import grasp, require_actions, speed_profile
 from jaxsimp.engines.engine import Execution, ExecutionStatus, Executor
 from jaxsimp.engines.mujoco.model import Variant, as_variant, make_model
 from jaxsimp.engines.population import MOST_WORKERS
+from jaxsimp.engines.trajectory import (
+    FRAMES_PER_SECOND,
+    Trajectory,
+    held_particles,
+    stride_of,
+)
 from jaxsimp.machine import num_cores
 from jaxsimp.tasks import Episode, Task, score
 from jaxsimp.tasks.episode import require_episode
@@ -62,6 +68,41 @@ class MuJoCo:
 
         return execute
 
+    def trajectory(
+        self,
+        task: Task,
+        episode: Episode,
+        actions: Actions,
+        frames_per_second: float = FRAMES_PER_SECOND,
+    ) -> Trajectory:
+        """See `Recorder.trajectory`; it ends when the body is at rest.
+
+        Raises:
+            ValueError: as `Recorder.trajectory`, or if the variant is unknown.
+        """
+        episode = require_episode(episode, task.body.num_particles)
+        actions = require_actions(actions, task.body.num_particles)
+        model = _model_of(task, [actions], self.variant)
+        stride = stride_of(_action_steps(task, model), task.action_seconds, frames_per_second)
+        start = np.asarray(episode.start, dtype=float)
+        scene = _Scene(task, task.simulation(), model, start, stride)
+        held = [np.zeros((0, actions.pick.shape[1]), dtype=int)]
+        for pick, displacement, holds in zip(
+            np.asarray(actions.pick),
+            np.asarray(actions.displacement),
+            held_particles(actions),
+            strict=True,
+        ):
+            before = len(scene.frames)
+            scene.act(pick, displacement)
+            held.append(np.tile(holds, (len(scene.frames) - before, 1)))
+        before = len(scene.frames)
+        scene.settle(task.settle_actions)
+        held.append(np.full((len(scene.frames) - before, actions.pick.shape[1]), NONE))
+        steps, positions = zip((0, start), *scene.frames, strict=True)
+        times = model.opt.timestep * np.array(steps)
+        return Trajectory(times, np.stack(positions), np.concatenate(held))
+
 
 def replay(
     task: Task,
@@ -96,12 +137,21 @@ def replay(
         require_count("num_workers", num_workers, 1, MOST_WORKERS)
     episodes = [require_episode(episode, task.body.num_particles) for episode in episodes]
     plans = [require_actions(plan, task.body.num_particles) for plan in plans]
+    model = _model_of(task, plans, variant)
+    one = partial(_replay_one, task, task.simulation(), model, jax.jit(partial(score, task)))
+    return _side_by_side(one, episodes, plans, num_workers or num_cores())
+
+
+def _model_of(task: Task, plans: Sequence[Actions], variant: str | Variant) -> Any:
+    """A model with pickers for all particles that plans grasp."""
     picked = {int(particle) for plan in plans for particle in np.unique(plan.pick)} - {NONE}
     if task.pinch is not None:  # what is between the fingers depends on the motion
         picked = set(range(task.body.num_particles))
-    model = make_model(task.body, variant, picked, obstacles=task.obstacles)
-    one = partial(_replay_one, task, task.simulation(), model, jax.jit(partial(score, task)))
-    return _side_by_side(one, episodes, plans, num_workers or num_cores())
+    return make_model(task.body, variant, picked, obstacles=task.obstacles)
+
+
+def _action_steps(task: Task, model: Any) -> int:
+    return max(1, round(task.action_seconds / model.opt.timestep))
 
 
 def _side_by_side(
@@ -139,21 +189,34 @@ def _replay_one(
 
 
 class _Scene:
-    """One simulation and the actions of pickers in it."""
+    """One simulation and the actions of pickers in it.
+
+    Attributes:
+        unstable: whether the simulation became unstable.
+        frames: number of steps since the start, and positions, after each `stride` steps of an
+            action and at its end; none without a stride.
+    """
 
     def __init__(
-        self, task: Task, simulation: Simulation, model: Any, start: Float[np.ndarray, "N 3"]
+        self,
+        task: Task,
+        simulation: Simulation,
+        model: Any,
+        start: Float[np.ndarray, "N 3"],
+        stride: int | None = None,
     ) -> None:
         import mujoco
 
         self._task, self._simulation = task, simulation  # of which the pickers' rules count
         self._model, self._data = model, mujoco.MjData(model)
         self._data.qpos[:] = (start - task.body.rest).ravel()
-        self._steps = max(1, round(task.action_seconds / model.opt.timestep))
+        self._steps, self._stride = _action_steps(task, model), stride
         self._pickers = make_pickers(task.limits, steps=self._steps, pinch=task.pinch)
         speed = np.asarray(speed_profile(self._steps), dtype=float)
         self._ahead = np.cumsum(speed) + (LEAD - 1) * speed
         self.unstable = False
+        self.frames: list[tuple[int, np.ndarray]] = []
+        self._done = 0
 
     def positions(self) -> Float[np.ndarray, "N 3"]:
         """Positions of the particles, metres; NaN once the simulation is unstable."""
@@ -194,6 +257,13 @@ class _Scene:
         return tuple(name.removeprefix("mjWARN_").lower() for name in names)
 
     def _step(self) -> None:
+        self._step_physics()
+        self._done += 1
+        during = self._done % self._steps
+        if self._stride and during % self._stride == 0:  # also at the end, where it is 0
+            self.frames.append((self._done, self.positions()))
+
+    def _step_physics(self) -> None:
         import mujoco
 
         if self.unstable:

@@ -11,6 +11,7 @@ from jaxsimp.bodies.topology import boundary_edges
 from jaxsimp.checks import require_reals
 from jaxsimp.dynamics import Obstacle, Table
 from jaxsimp.simplification import FitStatus, KeyPoints
+from jaxsimp.viz.shapes import project, surface_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 """Colours distinct for colour-blind readers (Okabe and Ito)."""
 GOAL_COLOR, OBSTACLE_COLOR = "#999999", "#e6c27a"
-FAR = 10.0
-"""Distance from which the surfaces of obstacles are looked at, metres."""
 Positions = Float[np.ndarray, "N 3"]
 
 
@@ -275,14 +274,8 @@ def _surface(
     """
     if np.isinf(obstacle.size()[1]):
         x, y = np.meshgrid(*(np.linspace(low, high, 9) for low, high in limits[:2]))
-        around = np.stack([x, y, np.full_like(x, limits[2].mean())])
-    else:
-        azimuth, height = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
-        flat = np.sin(height)
-        around = FAR * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.cos(height)])
-    found, normal = obstacle.distance(*around)
-    distance = np.asarray(found)[None]
-    return around - distance * np.stack([part * np.ones_like(distance[0]) for part in normal])
+        return project(obstacle, np.stack([x, y, np.full_like(x, limits[2].mean())]))[0]
+    return surface_grid(obstacle, 49, 25)[0]
 
 
 def _draw_model(axes: "Axes3D", body: Body, goal: Positions, model: KeyPoints) -> None:
