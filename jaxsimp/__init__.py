@@ -132,7 +132,7 @@ if TYPE_CHECKING:
         simplify_batch,
     )
     from jaxsimp.tasks import Episode, Task, make_task, reach, register, score, task_names
-    from jaxsimp.viz import Scene, animate, make_scene, scene_of_goal, scene_of_plan
+    from jaxsimp.viz import Scene, animate, make_scene, scene_of_goal, scene_of_plan, write_video
 
     __version__: str
 
@@ -259,6 +259,7 @@ __all__ = [
     "towel",
     "trousers",
     "viz",
+    "write_video",
 ]
 
 _ROOMS = {
@@ -281,7 +282,7 @@ _ROOMS = {
     "records": "SavedPlan load_plan save_plan",
     "simplification": "METHODS FitStatus KeyPoints Workspace simplify simplify_batch",
     "tasks": "Episode Task make_task reach register score task_names",
-    "viz": "Scene animate make_scene scene_of_goal scene_of_plan",
+    "viz": "Scene animate make_scene scene_of_goal scene_of_plan write_video",
 }
 """Names of the face: for each room the names that `jaxsimp` exports directly."""
 

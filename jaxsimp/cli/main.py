@@ -8,7 +8,7 @@ from typing import Any
 import jaxsimp
 from jaxsimp.cli.status import exit_status
 
-VERBS = ("simplify", "plan")
+VERBS = ("simplify", "plan", "view", "export")
 """Modules of `jaxsimp.cli` that are verbs."""
 DESCRIPTION = """Plan how to grasp and move rope and cloth.
 

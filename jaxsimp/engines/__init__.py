@@ -16,7 +16,8 @@ from jaxsimp.engines.mujoco import MuJoCo, replay
 from jaxsimp.engines.population import Layout, PopulationMap, default_layout
 from jaxsimp.engines.rollouts import RolloutExecutor, plan_cost, settled_score
 from jaxsimp.engines.springs import MassSprings, spring_chunk_size
-from jaxsimp.engines.trajectory import FRAMES_PER_SECOND, Recorder, Trajectory
+from jaxsimp.engines.trajectory import FRAMES_PER_SECOND, Recorder, Trajectory, grasps
+from jaxsimp.engines.waypoints import Waypoint, least_distance, waypoints
 
 __all__ = [
     "FRAMES_PER_SECOND",
@@ -37,13 +38,17 @@ __all__ = [
     "SearchEngine",
     "Spread",
     "Trajectory",
+    "Waypoint",
     "compare_with_mjx",
     "default_layout",
     "goal_scores",
+    "grasps",
+    "least_distance",
     "make_ensemble",
     "plan_cost",
     "replay",
     "settled_score",
     "spring_chunk_size",
     "then_idle",
+    "waypoints",
 ]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import jax
@@ -120,3 +121,14 @@ def _moved(
     stride: int, simulation: Simulation, pickers: Pickers, state: State, actions: Actions
 ) -> Float[Array, "T frames N 3"]:
     return rollout_in_frames(simulation, pickers, state, actions, stride)
+
+
+def grasps(trajectory: Trajectory) -> list[tuple[int, int, int]]:
+    """Picker, first and last frame of each time that a picker holds a particle, by picker."""
+    found = []
+    for picker, held in enumerate(trajectory.held.T):
+        bounds = np.flatnonzero(np.diff(held, prepend=NONE - 1, append=NONE - 1))
+        found += [
+            (picker, int(begin), int(end)) for begin, end in pairwise(bounds) if held[begin] != NONE
+        ]
+    return found

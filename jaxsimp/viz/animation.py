@@ -14,7 +14,7 @@ from jaxsimp.checks import require_path
 from jaxsimp.dynamics import Obstacle, Table
 from jaxsimp.records import write_text
 from jaxsimp.viz.scene import Scene
-from jaxsimp.viz.shapes import obstacle_mesh, outline, shown_faces, shown_radius
+from jaxsimp.viz.shapes import CELLS, obstacle_mesh, outline, shown_faces, shown_radius
 
 MOST_PANELS = 12
 """Most scenes in one page or video."""
@@ -22,8 +22,6 @@ MOST_COORDINATES = 50_000_000
 """Most coordinates in one page, 133 MB of text: a browser still opens it."""
 LEVELS = 2**16 - 1
 """Largest whole number of a quantised coordinate."""
-CELLS = 12
-"""Lines that are drawn on a cloth, over its size."""
 
 
 def animate(path: str | Path, scenes: Scene | Sequence[Scene]) -> None:
@@ -63,11 +61,16 @@ def require_scenes(scenes: Any) -> list[Scene]:
     shown = [scenes] if isinstance(scenes, Scene) else scenes
     if not isinstance(shown, Sequence) or not all(isinstance(each, Scene) for each in shown):
         raise ValueError(f"scenes is {scenes!r}; give a Scene or a list of them, see make_scene")
-    if not 1 <= len(shown) <= MOST_PANELS:
-        raise ValueError(
-            f"{len(shown)} scenes are given; give 1 to {MOST_PANELS}, to be seen beside one another"
-        )
+    require_count_of_scenes(len(shown))
     return list(shown)
+
+
+def require_count_of_scenes(count: int) -> None:
+    """Raise a `ValueError` for no scenes, or more than `MOST_PANELS`."""
+    if not 1 <= count <= MOST_PANELS:
+        raise ValueError(
+            f"{count} scenes are given; give 1 to {MOST_PANELS}, to be seen beside one another"
+        )
 
 
 def quantised(
@@ -111,11 +114,11 @@ def _panel(scene: Scene) -> dict[str, Any]:
 
 
 def _obstacle(obstacle: Obstacle, limits: Float[np.ndarray, "2 3"]) -> dict[str, str]:
-    points, normals, faces = obstacle_mesh(obstacle, limits)
+    mesh = obstacle_mesh(obstacle, limits)
     return {
-        "points": _text(points.astype("<f4")),
-        "normals": _text(normals.astype("<f4")),
-        "faces": _text(faces.astype("<u4")),
+        "points": _text(mesh.points.astype("<f4")),
+        "normals": _text(mesh.normals.astype("<f4")),
+        "faces": _text(mesh.faces.astype("<u4")),
     }
 
 

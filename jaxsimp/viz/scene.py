@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from jaxsimp.bodies import Body
 from jaxsimp.checks import keep, require_ids, require_reals
-from jaxsimp.dynamics import Actions, Obstacle, Table
+from jaxsimp.dynamics import NONE, Actions, Obstacle, Table
 from jaxsimp.dynamics.contact.obstacles import check_obstacles
 from jaxsimp.engines import (
     FRAMES_PER_SECOND,
@@ -17,6 +17,7 @@ from jaxsimp.engines import (
     MuJoCo,
     Recorder,
     Trajectory,
+    grasps,
 )
 from jaxsimp.goals import Positions, as_goal
 from jaxsimp.records import SavedPlan
@@ -192,3 +193,40 @@ def _finite_part(trajectory: Trajectory, body: Body) -> Trajectory:
         positions=positions[:count],
         held=trajectory.held[: count - 1],
     )
+
+
+def at_time(trajectory: Trajectory, time: float) -> tuple[Positions, Int[np.ndarray, " G"]]:
+    """Positions at a time, between frames on a straight line, and what each picker holds then.
+
+    Before the first frame it is the first one, after the last frame the last, with nothing held.
+    """
+    index, part = _interval(trajectory, time)
+    if index == len(trajectory.times) - 1:
+        return trajectory.positions[-1], np.full(trajectory.held.shape[1], NONE)
+    before, after = trajectory.positions[index : index + 2]
+    return (1 - part) * before + part * after, trajectory.held[index]
+
+
+def past_paths(trajectory: Trajectory, time: float) -> list[tuple[int, Positions]]:
+    """Paths of pickers up to a time: the picker, and positions of what it held, one each grasp."""
+    index, _ = _interval(trajectory, time)
+    now, _ = at_time(trajectory, time)
+    paths = []
+    for picker, begin, end in grasps(trajectory):
+        if begin > index or (begin == index and time <= trajectory.times[begin]):
+            continue
+        particle = trajectory.held[begin, picker]
+        path = trajectory.positions[begin : min(end, index) + 1, particle]
+        if end > index:
+            path = np.concatenate([path, now[None, particle]])
+        paths.append((picker, path))
+    return paths
+
+
+def _interval(trajectory: Trajectory, time: float) -> tuple[int, float]:
+    """The frame before a time, and the part of the way to the next one."""
+    times = trajectory.times
+    index = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 1))
+    if index == len(times) - 1:
+        return index, 0.0
+    return index, max(0.0, float((time - times[index]) / (times[index + 1] - times[index])))

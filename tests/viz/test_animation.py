@@ -16,29 +16,18 @@ from jaxsimp.dynamics import Box, Capsule, Plane, Sphere, Table
 from jaxsimp.engines import Trajectory
 from jaxsimp.viz.animation import LEVELS, MOST_PANELS, quantised, quantum
 from jaxsimp.viz.scene import Scene, scene_of_goal
-from jaxsimp.viz.shapes import obstacle_mesh, outline, shown_faces
+from jaxsimp.viz.shapes import obstacle_mesh, outline, shown_faces, tube
 from tests.viz.chromium import FOUND, browser
+from tests.viz.scenes import folded_cloth, lifted
 
 needs_chromium = pytest.mark.skipif(
     FOUND is None, reason="no Chromium is installed: apt-get install chromium"
 )
 
 
-def lifted(body, goal, title="a lift", **options):
-    """A scene: the body rises by 0.2 m in a second, one particle held; then it falls."""
-    times = np.linspace(0.0, 1.5, 16)
-    height = 0.2 * np.minimum(times, np.maximum(3 - 2 * times, 0.0))
-    start = goals.flat(body)
-    positions = start + height[:, None, None] * np.array([0.0, 0.0, 1.0])
-    held = np.where(np.arange(15) < 10, 0, -1)[:, None]
-    return Scene(title, body, goal, Trajectory(times, positions, held), **options)
-
-
 @pytest.fixture(scope="module")
 def cloth_scene():
-    body = cloth((9, 9))
-    goal = goals.fold_sequence(body, goals.rectangle_folds(body, "diagonal"))
-    return lifted(body, goal, key_points=[0, 8, 72, 80], score=0.9, costs=[0.3, 0.2, 0.1])
+    return folded_cloth()
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +154,8 @@ def test_wrong_scenes_are_refused(tmp_path, cloth_scene, monkeypatch):
 )
 def test_an_obstacle_is_drawn_where_its_distance_is_zero(obstacle):
     limits = np.array([[-0.5, -0.5, 0.0], [0.5, 0.5, 0.5]])
-    points, normals, faces = obstacle_mesh(obstacle, limits)
+    mesh = obstacle_mesh(obstacle, limits)
+    points, normals, faces = mesh.points, mesh.normals, mesh.faces
     np.testing.assert_allclose(
         obstacle.distance(*points.T)[0], 0.0, atol=5e-6
     )  # float32, from 10 m away
@@ -280,3 +270,16 @@ def test_a_goal_alone_has_no_slider(tmp_path, page):
     assert page.run("getComputedStyle(document.getElementById('player')).display") == "none"
     assert page.run("document.title") == "U"
     assert page.faults == []
+
+
+def test_a_tube_is_round_about_its_line_and_closed():
+    """Its volume is that of a cylinder and of a ball for both ends."""
+    line = np.stack([np.linspace(0, 1, 11), np.zeros(11), np.full(11, 0.5)], axis=1)
+    mesh = tube(line, 0.05)
+    a, b, c = np.moveaxis(mesh.points[mesh.faces], 1, 0)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    # Twelve sides: sin(30 degrees) / 30 degrees of the circle; ends of four rings have less.
+    assert abs(volume) == pytest.approx(np.pi * 0.05**2 * (1 + 4 / 3 * 0.05), rel=0.06)
+    nearest = mesh.points * [1, 0, 0] + [0, 0, 0.5]
+    nearest[:, 0] = nearest[:, 0].clip(0, 1)
+    np.testing.assert_allclose(np.linalg.norm(mesh.points - nearest, axis=1), 0.05, rtol=1e-6)

@@ -16,9 +16,10 @@ edges are soft constraints), has no bending stiffness, and passes through itself
 imported when called.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -144,6 +145,7 @@ def save_mjcf(
     position: Float[np.ndarray, "N 3"] | None = None,
     *,
     obstacles: Sequence[Obstacle] = (Table(),),
+    keyframes: Mapping[str, Float[np.ndarray, "N 3"]] = MappingProxyType({}),
 ) -> None:
     """Write a body as MJCF: `python -m mujoco.viewer --mjcf=PATH` opens it.
 
@@ -154,6 +156,7 @@ def save_mjcf(
         graspable: as for `make_model`.
         position: positions in a keyframe named "start", shape (N, 3), metres.
         obstacles: as for `make_model`.
+        keyframes: positions in further keyframes, by name.
 
     Raises:
         ValueError: as for `make_model`, or if positions are not those of the body.
@@ -162,9 +165,9 @@ def save_mjcf(
     require_path(Path(path), "give the path of a file that can be written")
     spec = _spec(body, as_variant(variant), graspable, obstacles)
     if position is not None:
-        places = require_positions("position", position, body.num_particles)
-        require_known("position", places)
-        spec.add_key(name="start", qpos=(np.asarray(places) - body.rest).ravel().tolist())
+        _add_keyframe(spec, "start", "position", position, body)
+    for name, given in keyframes.items():
+        _add_keyframe(spec, name, f"keyframes[{name!r}]", given, body)
     spec.compile()
     try:
         Path(path).write_text(spec.to_xml())
@@ -172,6 +175,12 @@ def save_mjcf(
         raise OSError(
             error.errno, f"{error.strerror}; give the path of a file that can be written", str(path)
         ) from error
+
+
+def _add_keyframe(spec: Any, name: str, told: str, position: Any, body: Body) -> None:
+    places = require_positions(told, position, body.num_particles)
+    require_known(told, places)
+    spec.add_key(name=name, qpos=(np.asarray(places) - body.rest).ravel().tolist())
 
 
 def _spec(
