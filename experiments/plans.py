@@ -201,6 +201,8 @@ def _run(
     plan = planner.plan(episode, candidates, search, run.seed, on_ask)
     execution = planner.execute(episode, plan.actions)
     file = plan_file(run)
+    searches = _searches(planner, plan)
+    costs = np.concatenate([each.optimum.best_costs for each in searches])
     records.save_plan(
         folder / file,
         task,
@@ -208,11 +210,14 @@ def _run(
         plan.actions,
         execution,
         engine=planner.evaluator,
-        found={"algorithm": repr(search), "seed": run.seed},
+        found={
+            "algorithm": repr(search),
+            "seed": run.seed,
+            "key_points": model.particles.tolist(),
+            "costs": costs[np.isfinite(costs)].tolist(),
+        },
         provenance=environment,
     )
-    searches = _searches(planner, plan)
-    costs = np.concatenate([each.optimum.best_costs for each in searches])
     own = np.array(counted_rollouts(search))
     counted = np.concatenate([own + index * own[-1] for index in range(len(searches))])
     score = execution.score if np.isfinite(execution.score) else None

@@ -17,7 +17,7 @@ from jaxsimp.engines.population import Layout, PopulationMap, default_layout
 from jaxsimp.engines.rollouts import RolloutExecutor, plan_cost, settled_score
 from jaxsimp.engines.springs import MassSprings, spring_chunk_size
 from jaxsimp.engines.trajectory import FRAMES_PER_SECOND, Recorder, Trajectory, grasps
-from jaxsimp.engines.waypoints import Waypoint, least_distance, waypoints
+from jaxsimp.engines.grippers import Waypoint, least_distance, waypoints
 
 __all__ = [
     "FRAMES_PER_SECOND",

@@ -142,14 +142,15 @@ def scene_of_plan(
         ValueError: if the file is of version 0.1, its task is damaged, or it holds key points that
             the body does not have.
     """
-    task, found = plan.task(), plan.about.get("found", {})
+    task, found = plan.task(), plan.about.get("found")
+    found = found if isinstance(found, dict) else {}
     named = {str(engine): engine for engine in ENGINES}
     assert plan.episode is not None  # or there is no task
     return make_scene(
         task,
         plan.episode,
         plan.actions,
-        named.get(plan.about.get("engine", ""), OUR_ENGINE),
+        named.get(str(plan.about.get("engine")), OUR_ENGINE),
         title=title,
         key_points=found.get("key_points", ()),
         costs=found.get("costs", ()),
