@@ -11,13 +11,13 @@ from jaxsimp.engines.engine import (
 )
 from jaxsimp.engines.ensemble import Ensemble, Spread, make_ensemble
 from jaxsimp.engines.goals import GoalScores, goal_scores
+from jaxsimp.engines.grippers import Waypoint, least_distance, waypoints
 from jaxsimp.engines.mjx import MJX, compare_with_mjx
 from jaxsimp.engines.mujoco import MuJoCo, replay
 from jaxsimp.engines.population import Layout, PopulationMap, default_layout
 from jaxsimp.engines.rollouts import RolloutExecutor, plan_cost, settled_score
 from jaxsimp.engines.springs import MassSprings, spring_chunk_size
 from jaxsimp.engines.trajectory import FRAMES_PER_SECOND, Recorder, Trajectory, grasps
-from jaxsimp.engines.grippers import Waypoint, least_distance, waypoints
 
 __all__ = [
     "FRAMES_PER_SECOND",

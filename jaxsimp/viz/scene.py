@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Array, Float, Int
 
 from jaxsimp.bodies import Body
 from jaxsimp.checks import keep, require_ids, require_reals
@@ -64,7 +64,9 @@ class Scene:
         if not isinstance(self.title, str):
             raise ValueError(f"title is {self.title!r}; give a text, as 'diagonal fold'")
         check_obstacles(self.obstacles, self.body)
-        costs = require_reals("costs", list(self.costs) or np.zeros(0), ("I",), "one a question")
+        costs = require_reals(
+            "costs", self.costs if len(self.costs) else np.zeros(0), ("I",), "one a question"
+        )
         keep(
             self,
             goal=as_goal(self.body, self.goal),
@@ -98,7 +100,7 @@ def make_scene(
     *,
     title: str | None = None,
     key_points: KeyPoints | Sequence[int] | np.ndarray = (),
-    costs: Sequence[float] | np.ndarray = (),
+    costs: Sequence[float] | Float[Array | np.ndarray, " I"] = (),
     frames_per_second: float = FRAMES_PER_SECOND,
 ) -> Scene:
     """The scene of a plan, which the engine carries out once more.
