@@ -53,10 +53,13 @@ class Options:
             OSError: if a file cannot be written.
         """
         from jaxsimp.checks import require_choice
+        from jaxsimp.cli.paths import require_writable
         from jaxsimp.engines import least_distance
 
         require_choice("to", self.to, FORMATS)
         out = self.out or Path(self.path.stem + ("" if self.to in FRAMES else f".{self._suffix}"))
+        if self.to not in FRAMES:
+            require_writable(out, "--out")
         if out.resolve() == self.path.resolve():
             raise ValueError(f"{out} is another file of this command; give another --out")
         plan = jaxsimp.load_plan(self.path)

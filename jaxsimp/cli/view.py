@@ -55,9 +55,17 @@ class Options:
             OSError: if a file cannot be written.
         """
         from jaxsimp import viz
+        from jaxsimp.cli.paths import require_writable
         from jaxsimp.viz.animation import require_count_of_scenes
         from jaxsimp.viz.video import require_video_path
 
+        used = [path.resolve() for path in self.paths]
+        for name, path in (("--html", self.html), ("--video", self.video)):
+            if path is not None:
+                require_writable(path, name)
+                if path.resolve() in used:
+                    raise ValueError(f"{path} is another file of this command; give another {name}")
+                used.append(path.resolve())
         if self.video:
             require_video_path(self.video)
         paths = [path for given in self.paths for path in plans_of(given)]
