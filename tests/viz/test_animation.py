@@ -222,9 +222,12 @@ def test_the_mouse_turns_and_zooms(tmp_path, page, rope_scene):
     viz.animate(tmp_path / "page.html", rope_scene)
     page.open(tmp_path / "page.html", "#t=0.5")
     first = page.picture()
-    page.drag(200, 200, 300, 220)
+    page.drag(200, 200, 300, 200)
     turned = page.picture()
     assert (np.abs(turned - first).max(axis=2) > 40).mean() > 0.002
+    page.drag(200, 200, 200, 240)
+    assert (np.abs(page.picture() - turned).max(axis=2) > 40).mean() > 0.002
+    turned = page.picture()
     page.mouse("mouseWheel", 200, 200, deltaX=0, deltaY=-400)
     zoomed = page.picture()
     assert is_drawn(zoomed).sum() > 1.5 * is_drawn(turned).sum()

@@ -61,7 +61,14 @@ def test_corners_are_drawn_where_the_camera_sees_them(scene):
     assert (places < [240, 180]).all()
 
 
-def test_from_below_the_back_is_seen_and_the_nearer_layer_hides_the_other(scene):
+def test_the_upper_layer_of_a_fold_hides_the_lower_one(scene):
+    """The upper layer is the back; of the lower one, the front, at most an edge is seen."""
+    picture = Painter(scene, 240, 180).paint(scene.goal)
+    back, front = is_like(picture, BACK).sum(), is_like(picture, FRONT).sum()
+    assert back > 20 * front
+
+
+def test_a_sheet_that_faces_down_shows_its_back(scene):
     painter, flat = Painter(scene, 240, 180), scene.trajectory.positions[10]
     turned = flat * [1, -1, 1]  # a mirror image faces down
     assert is_like(painter.paint(turned), BACK).mean() > 0.05
