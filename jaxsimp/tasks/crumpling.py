@@ -1,12 +1,12 @@
 """Random starts: SoftGym's crumpled states."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxsimp import goals
 from jaxsimp.bodies import Body
@@ -42,32 +42,34 @@ def crumple(body: Body, seed: int) -> Float[np.ndarray, "N 3"]:
     Raises:
         ValueError: if the seed is none.
     """
-    seed = require_seed(seed)
-    key_pick, key_move = jax.random.split(jax.random.key(seed))
+    return np.asarray(_compiled(body)(jax.random.key(require_seed(seed))))
+
+
+@cache
+def _compiled(body: Body) -> Callable[[PRNGKeyArray], Float[Array, "N 3"]]:
+    return jax.jit(partial(draw_crumpled, body))
+
+
+def draw_crumpled(body: Body, key: PRNGKeyArray) -> Float[Array, "N 3"]:
+    """`crumple` with the random picks of a key, in pure JAX."""
+    key_pick, key_move = jax.random.split(key)
     pick = jax.random.randint(key_pick, (4, 1), 0, body.num_particles)
     farthest = jnp.array([[FARTHEST]])
     nearest = farthest * jnp.array([[[-1.0, -1.0, 0.0]]])
     move = jax.random.uniform(key_move, (4, 1, 3), minval=nearest, maxval=farthest)
-    actions = Actions(pick, move)
-    return np.asarray(_drop(body)(actions))
+    return _drop(body, Actions(pick, move))
 
 
-@cache
-def _drop(body: Body) -> Callable[[Actions], Float[Array, "N 3"]]:
-    """Function that carries out actions on a flat body, which settles after each."""
+def _drop(body: Body, actions: Actions) -> Float[Array, "N 3"]:
+    """The positions after actions on a flat body, which settles after each."""
     time_step = min(1e-3, 0.9 * largest_time_step(body))
     simulation = make_simulation(body, time_step, self_contact=True, top_speed=TOP_SPEED)
     pickers = make_pickers(FARTHEST, steps=round(SECONDS / time_step))
     settle_steps = round(1.0 / time_step)
 
-    @jax.jit
-    def drop(actions: Actions) -> Float[Array, "N 3"]:
-        def one(position: Float[Array, "N 3"], action: Actions) -> tuple[Array, None]:
-            single = jax.tree.map(lambda array: array[None], action)
-            state, _ = rollout(simulation, pickers, at_rest(position), single)
-            return settle(simulation, state, settle_steps).position, None
+    def one(position: Float[Array, "N 3"], action: Actions) -> tuple[Array, None]:
+        single = jax.tree.map(lambda array: array[None], action)
+        state, _ = rollout(simulation, pickers, at_rest(position), single)
+        return settle(simulation, state, settle_steps).position, None
 
-        start = at_rest(goals.flat(body)).position
-        return jax.lax.scan(one, start, actions)[0]
-
-    return drop
+    return jax.lax.scan(one, at_rest(goals.flat(body)).position, actions)[0]

@@ -37,12 +37,13 @@ def rope_straightening(resolution: int) -> Task:
     """
     body = rope(resolution, ROPE_LENGTH)
     goal = goals.straight(body, SLACK * body.size)
-
+    start = CrumpledStart(body, goal)
     return Task(
         body=body,
         goal=goal,
         limits=ROPE_LIMITS,
-        episode_fn=CrumpledStart(body, goal),
+        episode_fn=start,
+        draw_fn=start.draw,
         running_cost=ends_cost,
         terminal_cost=ends_cost,
         running_weight=RUNNING_WEIGHT,

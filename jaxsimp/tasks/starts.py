@@ -1,7 +1,7 @@
 """Starts and goals of episodes: always the same, turned at random, or crumpled.
 
-A start is a function from a seed to an episode in NumPy. A start that needs no simulation also has
-`draw`, a function from a key to an episode, in pure JAX.
+A start is a function from a seed to an episode in NumPy. Its method `draw` is a function from a key
+to an episode, in pure JAX.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxsimp import goals
 from jaxsimp.bodies import Body
 from jaxsimp.checks import require_seed
-from jaxsimp.tasks.crumpling import crumple
+from jaxsimp.tasks.crumpling import crumple, draw_crumpled
 from jaxsimp.tasks.episode import Episode
 
 LARGEST_ANGLE = np.pi / 4
@@ -87,6 +87,10 @@ class CrumpledStart:
     def __call__(self, seed: int) -> Episode:
         """The episode of a seed; this runs a simulation."""
         return Episode(crumple(self.body, seed) + np.array([*self.place, 0.0]), self.goal)
+
+    def draw(self, key: PRNGKeyArray) -> Episode:
+        """The episode of a key, by a simulation; `jax.random.key(seed)` gives that of the seed."""
+        return Episode(draw_crumpled(self.body, key), _as_float(self.goal))
 
 
 def _turn(positions: Float[Array, "N 3"], angle: Float[Array, ""]) -> Float[Array, "N 3"]:

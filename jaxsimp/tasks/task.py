@@ -120,12 +120,12 @@ class Task:
         Starts and goals have the same distribution as those of `episode_fn`.
 
         Raises:
-            ValueError: if the task has no `draw_fn`, as its starts need a simulation.
+            ValueError: if the task has no `draw_fn`.
         """
         if self.draw_fn is None:
             raise ValueError(
-                f"the task {self.name!r} has no draw_fn, as its starts may need a simulation; use "
-                f"episode_fn(seed), or give the task a draw_fn"
+                f"the task {self.name!r} has no draw_fn; use episode_fn(seed), or give the task a "
+                f"draw_fn"
             )
         return self.draw_fn(key)
 

@@ -1,5 +1,7 @@
 """Starts of episodes: turned at random, or crumpled; by seed, and by key in batches."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -90,8 +92,23 @@ def test_a_drawn_start_of_a_straight_rope_is_that_of_every_seed(name):
     np.testing.assert_array_equal(drawn.goal, made.goal.astype(np.float32))
 
 
-def test_a_start_that_needs_a_simulation_is_not_drawn_by_key():
-    task = make_task("rope_straightening", 5)
-    assert task.draw_fn is None
-    with pytest.raises(ValueError, match=r"'rope_straightening' has no draw_fn.* episode_fn"):
+def test_a_crumpled_start_is_drawn_as_it_is_made():
+    task = make_task("rope_straightening", 11)
+    drawn = jax.jit(jax.vmap(task.draw_episode))(jax.vmap(jax.random.key)(np.arange(2)))
+    for index in range(2):
+        made = task.episode_fn(index)
+        # A batch is other machine code, and what lies on what amplifies its rounding.
+        np.testing.assert_allclose(drawn.start[index], made.start, atol=1e-3)
+        np.testing.assert_array_equal(drawn.goal[index], made.goal.astype(np.float32))
+
+
+def test_a_crumpled_start_of_another_body_is_refused():
+    task, other = make_task("rope_straightening", 5), make_task("rope_straightening", 6)
+    with pytest.raises(ValueError, match=r"draw_fn returns arrays of shapes .*\(6, 3\)"):
+        dataclasses.replace(task, draw_fn=other.draw_fn)
+
+
+def test_a_task_without_a_draw_fn_draws_no_episode():
+    task = dataclasses.replace(make_task("rope_folding", 5), draw_fn=None)
+    with pytest.raises(ValueError, match=r"'rope_folding' has no draw_fn.* episode_fn"):
         task.draw_episode(jax.random.key(0))
