@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         calibration,
         dynamics,
         engines,
+        envs,
         goal_plan,
         goals,
         planning,
@@ -93,6 +94,7 @@ if TYPE_CHECKING:
         replay,
     )
     from jaxsimp.engines.mujoco import make_model, save_mjcf
+    from jaxsimp.envs import Env, make_env
     from jaxsimp.goal_plan import GoalPlan, GoalPlanner, goal_planner, plan, plan_batch
     from jaxsimp.goals import Subgoal, find_folds, same_folds, subgoals
     from jaxsimp.planning import (
@@ -154,6 +156,7 @@ __all__ = [
     "Encoding",
     "Engine",
     "Ensemble",
+    "Env",
     "Episode",
     "Execution",
     "ExecutionStatus",
@@ -204,6 +207,7 @@ __all__ = [
     "default_algorithm",
     "dynamics",
     "engines",
+    "envs",
     "find_folds",
     "from_mesh",
     "goal_plan",
@@ -215,6 +219,7 @@ __all__ = [
     "load_mesh",
     "load_plan",
     "make_ensemble",
+    "make_env",
     "make_model",
     "make_pickers",
     "make_problem",
@@ -264,6 +269,7 @@ _ROOMS = {
     "engines": "Engine Ensemble Execution ExecutionStatus GoalScores Layout MassSprings MJX MuJoCo "
     "SearchEngine Spread compare_with_mjx goal_scores make_ensemble replay",
     "engines.mujoco": "make_model save_mjcf",
+    "envs": "Env make_env",
     "goal_plan": "GoalPlan GoalPlanner goal_planner plan plan_batch",
     "goals": "Subgoal find_folds same_folds subgoals",
     "planning": "CEM ENCODINGS ActionSpace Algorithm Categorical CoarseToFinePlanner Descent "

@@ -64,18 +64,30 @@ def rollout_observing(
     """`rollout`, but `observe` takes the state at the end of each action, and the action."""
     state = require_state(state, len(simulation.mass))
     actions = require_actions(actions, len(simulation.mass))
-    run = steps if adjoint else plain_steps
 
-    def act(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
-        position = unpack(simulation, moving[0]).position
-        around = simulation.rest, simulation.obstacles, simulation.radius
-        held, displacement = grasp(pickers, *around, position, action)
-        motion = Motion(held, displacement.T / simulation.time_step)
-        moving = run(simulation, moving, motion, speed_profile(pickers.steps))
+    def one(moving: Moving, action: Actions) -> tuple[Moving, PyTree[Any]]:
+        moving = act(simulation, pickers, moving, action, adjoint=adjoint)
         return moving, observe(end(simulation, moving), action)
 
-    moving, observations = jax.lax.scan(act, begin(simulation, state), actions)
+    moving, observations = jax.lax.scan(one, begin(simulation, state), actions)
     return end(simulation, moving), observations
+
+
+def act(
+    simulation: Simulation,
+    pickers: Pickers,
+    moving: Moving,
+    action: Actions,
+    *,
+    adjoint: bool = True,
+) -> Moving:
+    """The time steps of one action, shapes (G,) and (G, 3); see `rollout`."""
+    position = unpack(simulation, moving[0]).position
+    around = simulation.rest, simulation.obstacles, simulation.radius
+    held, displacement = grasp(pickers, *around, position, action)
+    motion = Motion(held, displacement.T / simulation.time_step)
+    run = steps if adjoint else plain_steps
+    return run(simulation, moving, motion, speed_profile(pickers.steps))
 
 
 def settle(simulation: Simulation, state: State, num_steps: int) -> State:
