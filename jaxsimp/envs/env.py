@@ -164,7 +164,7 @@ class Env:
             action: what each picker grasps, and where it moves that.
         """
         was_done = self._done(state)
-        plan = Plans(action.choice[None], jnp.clip(action.direction, -1.0, 1.0)[None])
+        plan = Plans(action.choice[None], action.direction[None])
         one = jax.tree.map(lambda leaf: leaf[0], self.space.actions(plan))
         count = state.num_actions + 1
         moving = act(self.simulation, self.pickers, state.moving, one)

@@ -12,7 +12,7 @@ from jaxsimp.engines.engine import then_idle
 from jaxsimp.envs import Env, EnvAction, EnvState, Transition, make_env
 from jaxsimp.planning import Plans
 from jaxsimp.simplification import simplify
-from jaxsimp.tasks import Episode, FixedStart, make_task, score
+from jaxsimp.tasks import Episode, FixedStart, distance_cost, make_task, score
 
 CANDIDATES = np.array([0, 4, 7])
 # float32 sums of metres in another order, grown over some hundred steps of stiff springs.
@@ -178,12 +178,13 @@ def test_an_action_that_is_not_finite_ends_the_episode(env, played):
 
 
 def test_a_start_that_costs_nothing_has_no_nan(env):
-    goal = env.task.goal
-    start = FixedStart(Episode(goal, goal))
-    cost = env.task.running_cost
-    free = fold(episode_fn=start, draw_fn=start.draw, terminal_cost=lambda e, s: cost(e, s) * 0)
-    found = jax.jit(free.step)(free.reset(jax.random.key(0)), drawn(free, 0))
-    assert (float(found.info["score"]), float(found.reward)) == (1.0, 0.0)
+    start = FixedStart(Episode(env.task.goal, env.task.goal))
+    free = fold(episode_fn=start, draw_fn=start.draw, terminal_cost=distance_cost)
+    final, found = jax.jit(lambda *given: episode_of(free, *given))(
+        free.reset(jax.random.key(0)), drawn(free, 0, 2)
+    )
+    assert float(final.score) == -np.inf  # see `jaxsimp.tasks.score`
+    assert found.reward.tolist() == [-np.inf, 0.0]
 
 
 def test_displacements_beyond_the_limits_are_clipped(env, played):
