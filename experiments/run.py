@@ -39,6 +39,8 @@ def _run() -> int:
     import tyro
     from rich.console import Console
 
+    from jaxsimp.xla_cache import keep_programs
+
     study: type[StudyOptions] = getattr(import_module(f"experiments.{name}"), STUDIES[name])
     options = tyro.cli(
         study,
@@ -46,6 +48,7 @@ def _run() -> int:
         args=arguments,
         description=f"{inspect.getdoc(study)}\n\nStudies: {', '.join(STUDIES)}.",
     )
+    keep_programs()
     options.run(Console())
     return 0
 

@@ -32,7 +32,11 @@ def _run(arguments: Sequence[str] | None) -> int:
     if given == ["--version"]:
         print(f"jaxsimp {jaxsimp.__version__}")
         return 0
-    return int(parse(given).run())
+    options = parse(given)
+    from jaxsimp.xla_cache import keep_programs  # late, as JAX is
+
+    keep_programs()
+    return int(options.run())
 
 
 def parse(arguments: Sequence[str]) -> Any:
