@@ -75,7 +75,7 @@ def test_another_process_loads_what_was_compiled_and_computes_the_same_bits(tmp_
 def test_a_folder_of_the_users_is_left_alone(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))  # JAX's is set in conftest.py
     keep_programs()
-    assert not files(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 # --- files ----------------------------------------------------------------------------------------
