@@ -14,6 +14,7 @@ import tyro
 from rich.console import Console
 
 import jaxsimp
+from jaxsimp.cli.hints import told_hints
 
 if TYPE_CHECKING:
     import numpy as np
@@ -159,11 +160,13 @@ def planner_of(options: Options) -> "GoalPlanner":
     """
     from jaxsimp.goal_plan import goal_planner
     from jaxsimp.goals import load_goal
+    from jaxsimp.tasks.reaching import STARTS
 
-    body, goal = _goal(options)
-    start: Any = options.start
-    if start not in ("flat", "crumpled"):
-        _, start = load_goal(start, body, scale=options.scale, up=options.up or "z")
+    with told_hints():
+        body, goal = _goal(options)
+        start: Any = options.start
+        if start not in STARTS:
+            _, start = load_goal(start, body, scale=options.scale, up=options.up or "z")
     return goal_planner(
         body,
         goal,

@@ -6,7 +6,6 @@ The face loads each room at first use, so that `jaxsimp --help` imports none of 
 import math
 import sys
 import time
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 import jaxsimp
+from jaxsimp.cli.hints import told_hints
 
 NO_MODEL = 1
 """Exit status if some goal has no model within the tolerance and the workspace."""
@@ -186,14 +186,9 @@ def simplified(options: Options) -> list[SimplifiedGoal]:
     from jaxsimp.goals import load_body, load_goal
 
     scale, up = options.scale, options.up
-    with warnings.catch_warnings(record=True) as hints:
-        warnings.simplefilter("always")
-        try:
-            body = load_body(options.body, scale=scale, up=up) if options.body else None
-            loaded = [load_goal(path, body, scale=scale, up=up or "z") for path in options.goals]
-        finally:  # a hint may say why what follows is refused
-            for hint in hints:
-                Console(stderr=True).print(f"hint: {hint.message}", markup=False, soft_wrap=True)
+    with told_hints():
+        body = load_body(options.body, scale=scale, up=up) if options.body else None
+        loaded = [load_goal(path, body, scale=scale, up=up or "z") for path in options.goals]
     # Files with equal body definitions are goals of one body.
     batches: dict[tuple[bytes, bytes], list[int]] = {}
     for index, (made, _) in enumerate(loaded):

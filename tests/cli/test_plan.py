@@ -88,6 +88,16 @@ def test_named_goals_and_a_start_of_ones_own(tmp_path):
     assert len(saved.actions.pick) == 1
 
 
+def test_points_of_another_order_are_registered_and_told(tmp_path, capsys):
+    np.savez("rope.npz", rest=ROPE.rest)
+    np.save("cloud.npy", np.random.default_rng(0).permutation(L_SHAPE))
+    command("cloud.npy", "--body", "rope.npz", "--actions", 1, "--no-verify")
+    goal = js.load_plan(tmp_path / "cloud-plan" / "plan.npz").episode.goal
+    ways = (goal, goal[::-1])  # the ends of a rope are alike
+    assert min(np.abs(way - L_SHAPE).max() for way in ways) < 0.02
+    assert "hint: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
