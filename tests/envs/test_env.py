@@ -143,7 +143,7 @@ def test_in_a_batch_only_what_ends_settles(env, played):
 
 def test_a_batch_settles_at_the_price_of_one_branch(env):
     # In the program of a batch the steps of settling are in a branch, not beside the others.
-    states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 3))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 3))
     program = str(jax.make_jaxpr(jax.vmap(env.step))(states, drawn(env, 0, 3)))
     assert "cond[" in program
 
@@ -198,26 +198,21 @@ def test_displacements_beyond_the_limits_are_clipped(env, played):
     )
 
 
-def test_the_reward_is_differentiable_by_the_displacement(env, played, x64):
-    state, actions, _ = played
-    as_double = lambda tree: jax.tree.map(  # noqa: E731 # of two trees, here alone
-        lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree
-    )
-    env, state, actions = (as_double(tree) for tree in (env, state, actions))
-    final = dataclasses.replace(env.step(state, jax.tree.map(lambda leaf: leaf[0], actions)).state)
-    choice = jnp.array([0, 3])
+def test_the_reward_is_differentiable_by_the_displacement(x64):
+    env = fold(num_actions=1, settle_actions=1)  # one step, in which it settles
+    start = jax.jit(env.reset)(jax.random.key(1))
 
     def reward(direction):
-        return env.step(final, EnvAction(choice, direction)).reward  # it settles, too
+        return env.step(start, EnvAction(jnp.array([0, 3]), direction)).reward
 
     at = jnp.array([[0.3, -0.4, 0.5], [0.0, 0.0, 0.0]])
     along = jnp.array([[1.0, -0.5, 0.7], [0.0, 0.0, 0.0]])
-    slope = (jax.jit(jax.grad(reward))(at) * along).sum()
+    slope = float((jax.jit(jax.grad(reward))(at) * along).sum())
     rewarded, h = jax.jit(reward), 1e-6
-    difference = (rewarded(at + h * along) - rewarded(at - h * along)) / (2 * h)
+    difference = float(rewarded(at + h * along) - rewarded(at - h * along)) / (2 * h)
     # Central differences: an error of h^2, and rounding of 1e-16 / h.
-    assert float(slope) == pytest.approx(float(difference), rel=1e-5)
-    assert abs(float(slope)) > 1e-3
+    assert slope == pytest.approx(difference, rel=1e-5)
+    assert abs(slope) > 1e-3
 
 
 def test_candidates_are_the_key_points_by_default():
