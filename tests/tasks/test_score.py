@@ -11,6 +11,11 @@ from jaxsimp.dynamics import State, at_rest
 from jaxsimp.tasks import Episode, make_task, score, task_names
 
 FOLDS = ("cloth_side_folding", "cloth_diagonal_folding")
+LAYERS = dict.fromkeys(FOLDS, 1) | {
+    "cloth_reflective_folding": 2,
+    "cloth_underneath_folding": 1,
+}
+"""Number of gaps of a thickness that a cost of the goal counts."""
 ROUNDING = 2e-6  # of costs, relative: see test_costs.py
 
 
@@ -22,7 +27,7 @@ def test_score_is_0_at_the_start_and_near_1_at_the_goal(name):
     assert float(score(task, episode, start)) == 0.0
     # A rope reaches its goal exactly. The layers of a fold stay a thickness (4 mm) apart.
     start_cost = float(task.terminal_cost(episode, at_rest(start)))
-    gap = 2 * task.body.radius / start_cost if name in FOLDS else 0.0
+    gap = LAYERS.get(name, 0) * 2 * task.body.radius / start_cost
     assert 1 - gap - ROUNDING <= float(score(task, episode, goal)) <= 1.0
 
 
