@@ -548,6 +548,7 @@ def test_the_adjoint_with_obstacles_is_the_slope_of_differences():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
+@pytest.mark.long
 def test_forward_and_reverse_mode_with_obstacles_agree():
     (reverse, inputs), (plain, _) = problem(ALL), problem(ALL, adjoint=False)
     found = jax.jit(jax.grad(lambda inputs: reverse(inputs)[0]))(inputs)
@@ -561,6 +562,7 @@ def test_forward_and_reverse_mode_with_obstacles_agree():
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("name", ["displacement", "obstacles"])
+@pytest.mark.long
 def test_a_batch_of_plans_and_of_obstacles_is_a_loop(name):
     # Cotangents of plans alone have the batch last, those of a simulation have it first.
     loss, inputs = problem(ALL[1:3])

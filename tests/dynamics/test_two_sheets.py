@@ -99,6 +99,7 @@ def test_front_and_back_of_a_dropped_t_shirt_hold_each_other_apart():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_dropped_t_shirts_settle_with_no_particles_closer_than_their_thickness_allows():
     near, wrong = drops(shirt(1600), range(20))
     assert (near >= 0.8).sum() >= 19
@@ -143,12 +144,14 @@ def test_four_layers_of_a_folded_doll_shirt_lie_in_order():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_four_layers_of_a_folded_t_shirt_lie_in_order():
     check_fold(shirt(6000), least=0.98)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
+@pytest.mark.long
 def test_gradients_through_contact_of_two_sheets_equal_differences():
     """By displacements of pickers, and by the start, in the air.
 

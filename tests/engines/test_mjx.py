@@ -59,6 +59,7 @@ def step_of(body: Body) -> float:
 @pytest.mark.slow  # MJX compiles for long
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("name", BODIES)
+@pytest.mark.long
 def test_mjx_moves_springs_as_we_do(name):
     body = BODIES[name]()
     found = compare_with_mjx(body, flung(body, 3.0), num_steps=200, time_step=step_of(body))
@@ -178,6 +179,7 @@ def test_a_rollout_on_an_obstacle_is_ours():
 
 
 @pytest.mark.slow  # MJX compiles for long
+@pytest.mark.long
 def test_a_plan_scores_the_same_in_both_engines():
     task, candidates = small_task(), np.array([0, 5, 10])
     algorithm = CEM(num_iterations=2, population=8, initial_populations=2)

@@ -203,6 +203,7 @@ def test_a_study_cut_short_in_a_row_goes_on_to_the_same_runs(folder, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_process_goes_on_to_the_same_runs(folder, tmp_path):
     out, rows = tmp_path / "killed", tmp_path / "killed" / "runs.jsonl"
     # A copy of what is compiled: a file that the kill cuts short must not be read by others.

@@ -77,6 +77,7 @@ def test_an_unknown_study_is_named_with_the_choices(monkeypatch, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_study_leaves_a_report_and_goes_on_after_a_kill(tmp_path, monkeypatch, figures_saved):
     folder = tmp_path / "results"
     options = ("--smoke", "--methods", "robust", "paper", "--out", folder)

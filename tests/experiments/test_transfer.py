@@ -197,6 +197,7 @@ def test_a_damaged_summary_of_the_plans_is_told(tmp_path, damaged):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_pictures")
+@pytest.mark.long
 def test_robust_plans_are_judged_in_an_ensemble(tmp_path):
     options = (*OPTIONS, "--tasks", "rope_folding", "--planning", "robust")
     out = tmp_path / "robust"
