@@ -14,22 +14,17 @@ import tyro
 from rich.console import Console
 
 import jaxsimp
+from jaxsimp.cli import plan_report
 from jaxsimp.cli.hints import told_hints
+from jaxsimp.cli.plan_report import FIGURE_FILE, PAGE_FILE, PLANS_FOLDER, ROWS_FILE, Row
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from jaxsimp.goal_plan import GoalPlan, GoalPlanner
 
-    Executions = dict[str, tuple[np.ndarray, float]]
-
-Row = dict[str, Any]
 FAILED = 1
 """Exit status if no plan is successful."""
 XYZ = tuple[float, float, float]
-ROWS_FILE, PLANS_FOLDER = "plans.jsonl", "plans"
 PLAN_FILE, RESULT_FILE, REPORT_FILE = "plan.npz", "result.json", "report.md"
-FIGURE_FILE, MODEL_FILE, PAGE_FILE = "plan.png", "key_points.png", "plan.html"
 FIELDS = ("score", "success", "rollouts", "seconds", "compile_seconds", "environment")
 """Fields of a row that the report reads."""
 
@@ -83,6 +78,8 @@ class Options:
     """Carry out the plan in MuJoCo, too."""
     out: Path | None = None
     """Folder of results; by default named after the goal, with -plan."""
+    mixed: bool = False
+    """Go on in a folder with rows of another environment; the report says so."""
     json: Path | None = None
     """Further file for the result, as an object."""
 
@@ -141,14 +138,16 @@ class Options:
         )
         folder = self.folder
         with jaxsimp.records.open_folder(folder, config(planner)):
-            rows = planned(planner, self.seeds, folder, console)
+            rows = planned(planner, self.seeds, folder, console, mixed=self.mixed)
             best = max(rows, key=lambda row: -math.inf if row["score"] is None else row["score"])
             console.print("replay in MuJoCo, and figures" if self.verify else "figures")
             result = write_result(planner, best, rows, folder, verify=self.verify)
         if self.json:
             jaxsimp.records.write_json(self.json, result)
         seconds = time.perf_counter() - begun
-        console.print(f"{told(result)}, in {seconds:.0f} s: {folder}/report.md", markup=False)
+        console.print(
+            f"{plan_report.told(result)}, in {seconds:.0f} s: {folder}/report.md", markup=False
+        )
         return 0 if result["success"] else FAILED
 
 
@@ -223,7 +222,9 @@ def config(planner: "GoalPlanner") -> dict[str, Any]:
     }
 
 
-def planned(planner: "GoalPlanner", num_seeds: int, folder: Path, console: Console) -> list[Row]:
+def planned(
+    planner: "GoalPlanner", num_seeds: int, folder: Path, console: Console, *, mixed: bool
+) -> list[Row]:
     """A row for each seed; those that the folder has are not planned again."""
     from jaxsimp import records
     from jaxsimp.cli.progress import progress_bar
@@ -232,10 +233,15 @@ def planned(planner: "GoalPlanner", num_seeds: int, folder: Path, console: Conso
     rows = records.RowFile(folder / ROWS_FILE, ("seed",), FIELDS)
 
     def fault(row: Row) -> str | None:
-        path = folder / plan_file(row["seed"])
-        return None if path.exists() else f"{path} is missing"
+        try:
+            records.load_plan(folder / plan_file(row["seed"]))
+        except (ValueError, OSError) as error:
+            return str(error)
+        return None
 
-    rows.resume(environment, fault=fault, tell=lambda line: console.print(line, markup=False))
+    rows.resume(
+        environment, mixed=mixed, fault=fault, tell=lambda line: console.print(line, markup=False)
+    )
     seeds = [(seed,) for seed in range(num_seeds)]
     left = rows.left(seeds)
     if left:
@@ -301,107 +307,11 @@ def write_result(
     files = {"plan": PLAN_FILE, "animation": PAGE_FILE, "figure": FIGURE_FILE}
     result |= {name: str(folder / file) for name, file in files.items()}
     result["environment"] = best["environment"]
-    save_figures(planner, executions, folder)
+    plan_report.save_figures(planner, executions, folder)
     viz.animate(folder / PAGE_FILE, viz.scene_of_plan(saved, title=planner.task.name))
     records.write_json(folder / RESULT_FILE, result)
-    records.write_text(folder / REPORT_FILE, report(planner, saved, result, rows))
+    records.write_text(folder / REPORT_FILE, plan_report.report(planner, saved, result, rows))
     return result
-
-
-def save_figures(planner: "GoalPlanner", executions: "Executions", folder: Path) -> None:
-    """Write the pictures of the goal's model and of the executions."""
-    from jaxsimp import viz
-    from jaxsimp.records.markdown import save_figure
-
-    task = planner.task
-    model = viz.plot_simplifications({task.name: (task.body, task.goal, planner.key_points)})
-    save_figure(model, folder / MODEL_FILE)
-    plan = viz.plot_executions(task.body, task.goal, executions, task.name, task.obstacles)
-    save_figure(plan, folder / FIGURE_FILE)
-
-
-def report(planner: "GoalPlanner", saved: "jaxsimp.SavedPlan", result: Row, rows: list[Row]) -> str:
-    """The report, in Markdown."""
-    from jaxsimp.records.markdown import provenance, table
-
-    task = planner.planner.task
-    is_verified = "mujoco_full_score" in result
-    in_mujoco = [["score in MuJoCo", _told(result["mujoco_full_score"])]] if is_verified else []
-    summary = table(
-        ["", ""],
-        [
-            ["score of the best plan", _told(result["score"])],
-            *in_mujoco,
-            ["plans, successful", f"{len(rows)}, {sum(row['success'] for row in rows)}"],
-            ["key points", result["key_points"]],
-            ["actions, pickers", f"{result['num_actions']}, {task.num_pickers}"],
-            [
-                "search (s), compilation (s)",
-                f"{result['seconds']:.1f}, {result['compile_seconds']:.1f}",
-            ],
-            ["rollouts", result["rollouts"]],
-        ],
-    )
-    plans = table(
-        ["seed", "score", "seconds", "rollouts"],
-        [
-            [row["seed"], _told(row["score"]), f"{row['seconds']:.1f}", row["rollouts"]]
-            for row in rows
-        ],
-    )
-    return "\n".join(
-        [
-            f"# Plan for {task.name}",
-            "",
-            *summary,
-            "",
-            "The score is `(c_0 - c) / c_0` of the settled state, with its cost `c` and that of "
-            "the start, `c_0`: 1 at the goal.",
-            "",
-            f"Open [{PAGE_FILE}]({PAGE_FILE}) in a browser to see it move.",
-            "",
-            f"![Execution of the plan]({FIGURE_FILE})",
-            "",
-            f"![Key points of the goal]({MODEL_FILE})",
-            "",
-            "## Actions",
-            *table(["action", "picker", "particle", "dx, dy, dz (mm)"], _actions(saved)),
-            "",
-            "## Plans",
-            *plans,
-            "",
-            *provenance(rows, f"Plans in `{PLANS_FOLDER}`, rows in `{ROWS_FILE}`"),
-            "",
-        ]
-    )
-
-
-def _actions(saved: "jaxsimp.SavedPlan") -> list[list[object]]:
-    """A line for each action of a picker that holds a particle."""
-    import numpy as np
-
-    pick, moves = np.asarray(saved.actions.pick), np.asarray(saved.actions.displacement)
-    return [
-        [
-            action + 1,
-            picker + 1,
-            pick[action, picker],
-            ", ".join(f"{1e3 * each:.0f}" for each in moves[action, picker]),
-        ]
-        for action, picker in np.argwhere(pick != jaxsimp.NONE)
-    ]
-
-
-def _told(score: float | None) -> str:
-    return "none (the simulation became unstable)" if score is None else f"{score:.3f}"
-
-
-def told(result: Row) -> str:
-    """The scores of a result, in words."""
-    said = f"score {_told(result['score'])}"
-    if "mujoco_full_score" in result:
-        said += f", in MuJoCo {_told(result['mujoco_full_score'])}"
-    return said
 
 
 def _replayed(planner: "GoalPlanner", saved: "jaxsimp.SavedPlan") -> "jaxsimp.Execution":

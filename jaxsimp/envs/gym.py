@@ -134,7 +134,7 @@ class TaskEnv(gymnasium.Env[Dict, Dict]):
         env: the environment as pure functions.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 # as the class above has it
+    metadata: dict[str, Any] = {  # noqa: RUF012 # Gymnasium's base has it alike
         "render_modes": RENDER_MODES,
         "render_fps": 4,
     }
@@ -209,7 +209,7 @@ class TaskVectorEnv(VectorEnv[Dict, Dict, np.ndarray]):
         env: one environment as pure functions.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012 # as the class above has it
+    metadata: dict[str, Any] = {  # noqa: RUF012 # Gymnasium's base has it alike
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }

@@ -1,5 +1,6 @@
 """Tasks of cloths: the two folds of the paper, after SoftGym and fabric-vsf, and more."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ from jaxsimp.tasks.registry import register
 from jaxsimp.tasks.starts import TurnedStart
 from jaxsimp.tasks.task import Task
 
+PositionCost = Callable[..., Float[Array, ""]]
+"""A cost of positions: of an episode, a state, and an action that it ignores."""
 STILL_WEIGHT = 1.2
 """Weight of the displacement of the still half, after SoftGym."""
 
@@ -76,19 +79,7 @@ def _fold_task(
         mirror: id of the mirror image of each particle, shape (N,).
     """
     goal = goals.fold(body, goals.flat(body), np.zeros(2), np.array(direction))
-    start, cost = TurnedStart(body, goal), FoldCost(moving, mirror[moving])
-    return Task(
-        body=body,
-        goal=goal,
-        episode_fn=start,
-        draw_fn=start.draw,
-        running_cost=cost,
-        terminal_cost=cost,
-        running_weight=RUNNING_WEIGHT,
-        limits=(0.2, 0.2, 0.2),
-        num_actions=2,
-        action_seconds=0.25,
-    )
+    return turned_task(body, goal, FoldCost(moving, mirror[moving]), num_actions=2)
 
 
 @register(full=25, quick=9, group="goals")
@@ -119,14 +110,33 @@ def flat_task(body: Body, goal: goals.Positions, num_actions: int) -> Task:
 
     The cost is the mean distance of the particles to their goals.
     """
-    start = TurnedStart(body, goal)
+    return turned_task(body, goal, distance_cost, num_actions)
+
+
+def turned_task(
+    body: Body,
+    goal: goals.Positions,
+    cost: PositionCost,
+    num_actions: int,
+    start: goals.Positions | None = None,
+) -> Task:
+    """A task whose start and goal are turned by a random angle, see `TurnedStart`.
+
+    Args:
+        body: a cloth or a garment.
+        goal: goal before the turn, shape (N, 3), metres.
+        cost: cost of a state, on the way and at the end.
+        num_actions: number of actions in a plan.
+        start: start before the turn, shape (N, 3), metres; the flat body by default.
+    """
+    turned = TurnedStart(body, goal, start)
     return Task(
         body=body,
         goal=goal,
-        episode_fn=start,
-        draw_fn=start.draw,
-        running_cost=distance_cost,
-        terminal_cost=distance_cost,
+        episode_fn=turned,
+        draw_fn=turned.draw,
+        running_cost=cost,
+        terminal_cost=cost,
         running_weight=RUNNING_WEIGHT,
         limits=(0.2, 0.2, 0.2),
         num_actions=num_actions,

@@ -17,11 +17,10 @@ from jaxtyping import Array, Float, Int
 from jaxsimp import goals
 from jaxsimp.bodies import Body, cloth
 from jaxsimp.dynamics import Actions, State
-from jaxsimp.tasks.cloth import STILL_WEIGHT
-from jaxsimp.tasks.costs import RUNNING_WEIGHT, distance
+from jaxsimp.tasks.cloth import STILL_WEIGHT, turned_task
+from jaxsimp.tasks.costs import distance
 from jaxsimp.tasks.episode import Episode
 from jaxsimp.tasks.registry import register
-from jaxsimp.tasks.starts import TurnedStart
 from jaxsimp.tasks.task import Task
 
 ALONG_Y = np.array([0.0, 1.0])
@@ -74,7 +73,8 @@ def cloth_reflective_folding(resolution: int) -> Task:
     strips = _strips(resolution)
     half, back = _states(strips)
     pairs = np.stack([strips.a, strips.b]), np.stack([strips.b, strips.c])
-    return _task(strips, half, back, StripsCost(pairs, strips.still, np.zeros(0, int)))
+    cost = StripsCost(pairs, strips.still, np.zeros(0, int))
+    return turned_task(strips.body, back, cost, num_actions=2, start=half)
 
 
 @register(full=25, quick=9, group="folded")
@@ -86,7 +86,8 @@ def cloth_underneath_folding(resolution: int) -> Task:
     upper[strips.still] = False
     under = goals.fold(strips.body, back, np.zeros(2), -ALONG_Y, part=upper)
     pairs = (np.stack([strips.a, strips.b]),)
-    return _task(strips, back, under, StripsCost(pairs, strips.still, strips.a))
+    cost = StripsCost(pairs, strips.still, strips.a)
+    return turned_task(strips.body, under, cost, num_actions=2, start=back)
 
 
 def _strips(resolution: int) -> _Strips:
@@ -111,19 +112,3 @@ def _states(strips: _Strips) -> tuple[goals.Positions, goals.Positions]:
     outer[strips.a] = True
     quarter = np.array([body.size / 4, 0.0])
     return half, goals.fold(body, half, quarter, -ALONG_Y, part=outer)
-
-
-def _task(strips: _Strips, start: goals.Positions, goal: goals.Positions, cost: StripsCost) -> Task:
-    turned = TurnedStart(strips.body, goal, start)
-    return Task(
-        body=strips.body,
-        goal=goal,
-        episode_fn=turned,
-        draw_fn=turned.draw,
-        running_cost=cost,
-        terminal_cost=cost,
-        running_weight=RUNNING_WEIGHT,
-        limits=(0.2, 0.2, 0.2),
-        num_actions=2,
-        action_seconds=0.25,
-    )

@@ -67,7 +67,21 @@ def test_the_same_command_resumes(tmp_path, monkeypatch):
     (folder / "plans" / "1.npz").unlink()
     command("l.npy", "--seeds", 2, "--no-verify")
     assert planned == [1]
+    (folder / "plans" / "0.npz").write_bytes(b"no plan")
+    command("l.npy", "--seeds", 2, "--no-verify")
+    assert planned == [1, 0]
     assert "mujoco_full_score" not in json.loads((folder / "result.json").read_text())
+
+
+def test_rows_of_another_environment_are_kept_where_that_is_asked_for(tmp_path, capsys):
+    command("l.npy", "--no-verify")
+    rows = tmp_path / "l-plan" / "plans.jsonl"
+    row = json.loads(rows.read_text())
+    row["environment"]["cores"] += 1
+    rows.write_text(json.dumps(row) + "\n")
+    assert command("l.npy", "--no-verify") == 2
+    assert "--mixed to go on" in " ".join(capsys.readouterr().err.split())
+    assert command("l.npy", "--no-verify", "--mixed") in (0, 1)
 
 
 def test_another_goal_has_another_folder(capsys):

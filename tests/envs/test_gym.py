@@ -9,6 +9,7 @@ import pytest
 
 gymnasium = pytest.importorskip("gymnasium")
 
+# What follows imports Gymnasium, an extra, and would fail without it: hence E402.
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from jaxsimp.envs import EnvAction  # noqa: E402
