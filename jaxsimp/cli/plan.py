@@ -48,9 +48,14 @@ class Options:
     """The body at rest, as for `jaxsimp simplify`; a cloth of 0.3 m or a rope of 0.5 m by default
     for --fold and --letter."""
     fold: str | None = None
-    """Folds of a rectangular cloth as the goal: side, diagonal, quarter, letter, four_corners."""
+    """Folds as the goal: side, diagonal, quarter, letter or four_corners, of the rectangle around
+    what lies; sleeves_in of a T-shirt, or leg_over_leg of trousers, made from dimensions."""
     letter: str | None = None
     """Letter as the goal of a rope: C, M, O, S or U."""
+    particles: int | None = None
+    """Number of particles that the body is meshed anew with; those of its file by default."""
+    press: bool = False
+    """Lay the body, a garment as worn or modelled in space, on the table, pressed flat."""
     start: str = "flat"
     """Start: flat, crumpled, or a file of positions."""
     scale: float = 1.0
@@ -92,14 +97,11 @@ class Options:
         from jaxsimp.bodies.size import require_scale
         from jaxsimp.checks import require_choice, require_count
         from jaxsimp.cli.paths import require_writable
+        from jaxsimp.cli.plan_goal import check_goal
         from jaxsimp.goal_plan import SEARCHES
         from jaxsimp.tasks import COSTS
 
-        given = [each for each in (self.goal, self.fold, self.letter) if each is not None]
-        if len(given) != 1:
-            raise ValueError(
-                f"{len(given)} goals are given to plan for; give one: a file, --fold or --letter"
-            )
+        check_goal(self)
         require_choice("planner", self.planner, SEARCHES)
         require_choice("cost", self.cost, COSTS)
         require_choice("up", self.up or "z", ("x", "y", "z"))
@@ -157,12 +159,13 @@ def planner_of(options: Options) -> "GoalPlanner":
     Raises:
         ValueError: if a file or an option is invalid.
     """
+    from jaxsimp.cli.plan_goal import body_and_goal
     from jaxsimp.goal_plan import goal_planner
     from jaxsimp.goals import load_goal
     from jaxsimp.tasks.reaching import STARTS
 
     with told_hints():
-        body, goal = _goal(options)
+        body, goal = body_and_goal(options)
         start: Any = options.start
         if start not in STARTS:
             _, start = load_goal(start, body, scale=options.scale, up=options.up or "z")
@@ -179,21 +182,6 @@ def planner_of(options: Options) -> "GoalPlanner":
         pinch=jaxsimp.Pinch(*options.pinch) if options.pinch else None,
         name=options.name,
     )
-
-
-def _goal(options: Options) -> "tuple[jaxsimp.Body, jaxsimp.goals.Positions]":
-    """The body and its goal."""
-    from jaxsimp import goals
-
-    scale, up = options.scale, options.up
-    given = goals.load_body(options.body, scale=scale, up=up) if options.body else None
-    if options.goal:
-        return goals.load_goal(options.goal, given, scale=scale, up=up or "z")
-    if options.letter:
-        body = given or jaxsimp.rope()
-        return body, goals.letter(body, options.letter)
-    body = given or jaxsimp.cloth()
-    return body, goals.fold_sequence(body, goals.rectangle_folds(body, str(options.fold)))
 
 
 def config(planner: "GoalPlanner") -> dict[str, Any]:

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 
 import jaxsimp as js
 from jaxsimp import goal_plan, goals
@@ -12,6 +13,7 @@ from jaxsimp.planning import CEM, Joint
 
 ROPE = js.rope(11, 0.4)
 L_SHAPE = goals.polyline(ROPE, np.array([[0.0, 0.0], [0.25, 0.0], [0.25, 0.15]]))
+LYING = trimesh.transformations.rotation_matrix(np.pi / 2, [1.0, 0.0, 0.0])
 SMALL = CEM(num_iterations=3, population=24, initial_populations=1, encoding=Joint())
 
 
@@ -25,6 +27,11 @@ def small_search(monkeypatch, tmp_path):
 def command(*options):
     """What `jaxsimp plan` does, without another process."""
     return main(["plan", *map(str, options)])
+
+
+def told(capsys):
+    """What the command wrote to stderr, in one line."""
+    return " ".join(capsys.readouterr().err.split())
 
 
 def test_a_goal_becomes_a_folder_with_plan_report_and_figures(tmp_path, capsys):
@@ -102,6 +109,39 @@ def test_named_goals_and_a_start_of_ones_own(tmp_path):
     assert len(saved.actions.pick) == 1
 
 
+def test_a_garment_of_a_file_is_meshed_anew_pressed_and_folded(tmp_path, capsys):
+    tube = trimesh.creation.cylinder(0.1, 0.3, sections=40, transform=LYING)
+    open_ends = tube.face_normals[:, 1].round(3)
+    tube.update_faces(np.abs(open_ends) < 0.5)
+    tube.subdivide().export("tube.obj")
+    options = ("--fold", "side", "--body", "tube.obj", "--particles", 60, "--no-verify")
+    assert command(*options) == 2
+    assert "does not lie flat. Press it flat (jaxsimp.press, --press)" in told(capsys)
+    command(*options, "--press", "--out", "one", "--actions", 1)
+    assert "the mesh lies in layers" in told(capsys)
+    command(*options, "--press", "--pinch", 0.08, 2, "--out", "here")
+    assert "hint" not in told(capsys)
+    saved = js.load_plan(tmp_path / "here" / "plan.npz")
+    body, goal = saved.body, saved.episode.goal
+    assert body.num_particles == pytest.approx(60, rel=0.1)
+    # Pressed, the tube is half its circumference wide; folded, half as wide again, in four layers.
+    across = np.ptp(body.rest[:, :2], axis=0)
+    assert np.abs(across - np.pi * 0.1).min() < 0.03
+    assert np.ptp(goal[:, 0]) == pytest.approx(np.ptp(body.rest[:, 0]) / 2, rel=0.1)
+    assert np.ptp(goal[:, 2]) >= 3 * 2 * body.radius * 0.9
+
+
+@pytest.mark.parametrize(
+    ("fold", "name"), [("sleeves_in", "t_shirt"), ("leg_over_leg", "trousers")]
+)
+def test_garments_made_from_dimensions_are_folded_by_name(fold, name, tmp_path):
+    command("--fold", fold, "--particles", 80, "--actions", 1, "--no-verify", "--out", "here")
+    saved = js.load_plan(tmp_path / "here" / "plan.npz")
+    garment = getattr(js, name)(num_particles=80)
+    wanted = goals.fold_sequence(garment.body, getattr(goals, fold)(garment))
+    np.testing.assert_allclose(saved.episode.goal, wanted, atol=1e-6)
+
+
 def test_points_of_another_order_are_registered_and_told(tmp_path, capsys):
     np.savez("rope.npz", rest=ROPE.rest)
     np.save("cloud.npy", np.random.default_rng(0).permutation(L_SHAPE))
@@ -117,13 +157,17 @@ def test_points_of_another_order_are_registered_and_told(tmp_path, capsys):
     [
         ((), "0 goals are given to plan for"),
         (("l.npy", "--letter", "M"), "2 goals are given to plan for"),
+        (("--fold", "twice"), "fold is 'twice'"),
+        (("--fold", "sleeves_in", "--press"), "folds a t_shirt made from dimensions"),
+        (("l.npy", "--press"), "--press and --particles change a body"),
+        (("--letter", "M", "--particles", 40), "--press and --particles change a body"),
+        (("--fold", "side", "--particles", 2), "particles is 2"),
         (("l.npy", "--planner", "best"), "planner is 'best'"),
         (("l.npy", "--seeds", 0), "seeds is 0"),
         (("l.npy", "--cost", "speed"), "cost is 'speed'"),
         (("l.npy", "--json", "none/result.json"), "none is no folder"),
         (("none.npy",), "none.npy"),
         (("l.npy", "--start", "none.npy"), "none.npy"),
-        (("--fold", "twice"), "fold is 'twice'"),
     ],
 )
 def test_what_is_refused(tmp_path, capsys, options, message):
