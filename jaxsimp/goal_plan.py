@@ -217,6 +217,7 @@ def goal_planner(
     limits: tuple[float, float, float] | None = None,
     obstacles: tuple[Obstacle, ...] = (Table(),),
     pinch: Pinch | None = None,
+    gripper_distance: float = 0.0,
     name: str = "reach",
 ) -> GoalPlanner:
     """A planner for a goal of your own.
@@ -235,6 +236,7 @@ def goal_planner(
         limits: largest displacement of an action, as for `jaxsimp.reach`.
         obstacles: rigid bodies at rest.
         pinch: what a picker holds besides the particle that an action names.
+        gripper_distance: least distance of two pickers that both hold something, metres.
         name: name of the task.
 
     Raises:
@@ -253,6 +255,7 @@ def goal_planner(
         limits=limits,
         obstacles=obstacles,
         pinch=pinch,
+        gripper_distance=gripper_distance,
         name=name,
     )
     return GoalPlanner(task, key_points, search)

@@ -75,6 +75,9 @@ class Options:
     pinch: Annotated[tuple[float, int] | None, tyro.conf.arg(metavar="RADIUS LAYERS")] = None
     """Fingers that hold all within a radius, metres, and so many layers on either side of the
     particle's own; that particle alone by default."""
+    gripper_distance: float = 0.0
+    """Least distance of two grippers that both hold something, metres; plans in which they come
+    nearer cost more."""
     seeds: int = 1
     """Number of plans, of which the one of the highest score is kept."""
     tolerance: float | None = None
@@ -180,6 +183,7 @@ def planner_of(options: Options) -> "GoalPlanner":
         num_pickers=options.pickers,
         limits=options.limits,
         pinch=jaxsimp.Pinch(*options.pinch) if options.pinch else None,
+        gripper_distance=options.gripper_distance,
         name=options.name,
     )
 
@@ -205,6 +209,7 @@ def config(planner: "GoalPlanner") -> dict[str, Any]:
         "num_pickers": task.num_pickers,
         "limits": list(task.limits),
         "pinch": None if task.pinch is None else vars(task.pinch),
+        "gripper_distance": task.gripper_distance,
         "action_seconds": task.action_seconds,
         "time_step": task.time_step,
     }
@@ -274,6 +279,7 @@ def write_result(
     from shutil import copyfile
 
     from jaxsimp import records, viz
+    from jaxsimp.engines import least_distance
 
     saved = records.load_plan(folder / plan_file(best["seed"]))
     with records.whole_file(folder / PLAN_FILE) as part:
@@ -292,11 +298,13 @@ def write_result(
         replayed = _replayed(planner, saved)
         executions["carried out in MuJoCo"] = replayed.positions, replayed.score
         result["mujoco_full_score"] = replayed.score if math.isfinite(replayed.score) else None
+    scene = viz.scene_of_plan(saved, title=planner.task.name)
+    result["least_gripper_distance"] = least_distance(scene.trajectory)
     files = {"plan": PLAN_FILE, "animation": PAGE_FILE, "figure": FIGURE_FILE}
     result |= {name: str(folder / file) for name, file in files.items()}
     result["environment"] = best["environment"]
     plan_report.save_figures(planner, executions, folder)
-    viz.animate(folder / PAGE_FILE, viz.scene_of_plan(saved, title=planner.task.name))
+    viz.animate(folder / PAGE_FILE, scene)
     records.write_json(folder / RESULT_FILE, result)
     records.write_text(folder / REPORT_FILE, plan_report.report(planner, saved, result, rows))
     return result

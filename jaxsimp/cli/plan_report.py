@@ -50,6 +50,7 @@ def report(planner: "GoalPlanner", saved: "jaxsimp.SavedPlan", result: Row, rows
                 f"{result['seconds']:.1f}, {result['compile_seconds']:.1f}",
             ],
             ["rollouts", result["rollouts"]],
+            ["least distance between grippers", _distance(result["least_gripper_distance"])],
         ],
     )
     plans = table(
@@ -100,6 +101,10 @@ def _actions(saved: "jaxsimp.SavedPlan") -> list[list[object]]:
         ]
         for action, picker in np.argwhere(pick != jaxsimp.NONE)
     ]
+
+
+def _distance(least: float | None) -> str:
+    return "one holds at a time" if least is None else f"{1e3 * least:.0f} mm"
 
 
 def _told(score: float | None) -> str:

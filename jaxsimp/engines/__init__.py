@@ -15,7 +15,7 @@ from jaxsimp.engines.grippers import Waypoint, least_distance, waypoints
 from jaxsimp.engines.mjx import MJX, compare_with_mjx
 from jaxsimp.engines.mujoco import MuJoCo, replay
 from jaxsimp.engines.population import Layout, PopulationMap, default_layout
-from jaxsimp.engines.rollouts import RolloutExecutor, plan_cost, settled_score
+from jaxsimp.engines.rollouts import RolloutExecutor, plan_cost, settled_cost
 from jaxsimp.engines.springs import MassSprings, spring_chunk_size
 from jaxsimp.engines.trajectory import FRAMES_PER_SECOND, Recorder, Trajectory, grasps
 
@@ -47,7 +47,7 @@ __all__ = [
     "make_ensemble",
     "plan_cost",
     "replay",
-    "settled_score",
+    "settled_cost",
     "spring_chunk_size",
     "then_idle",
     "waypoints",

@@ -14,6 +14,7 @@ from jaxsimp.engines.engine import Execution, ExecutionStatus, SearchEngine, the
 from jaxsimp.engines.population import Layout, PopulationMap
 from jaxsimp.tasks import Episode, Task, score
 from jaxsimp.tasks.episode import require_episode
+from jaxsimp.tasks.grippers import WEIGHT, violation
 
 
 def plan_cost(
@@ -23,6 +24,7 @@ def plan_cost(
 
     The terminal cost is that of the state one action's duration after the pickers have let go.
     The paper sums the same cost over all steps (section IV-A), with `Task.running_weight` 1.
+    Grippers nearer to one another than `Task.gripper_distance` cost extra.
 
     Raises:
         ValueError: if the plan is not of the body, see `jaxsimp.dynamics.Actions`.
@@ -31,33 +33,50 @@ def plan_cost(
     terminal_cost: object = task.terminal_cost
     is_one_cost = task.running_cost is terminal_cost  # which is then taken once
 
-    def observe(state: State, action: Actions) -> tuple[Float[Array, ""], ...]:
+    def observe(state: State, action: Actions) -> tuple[tuple[Float[Array, ""], ...], ...]:
         running = task.running_cost(episode, state, action)
-        return (running,) if is_one_cost else (running, task.terminal_cost(episode, state))
+        costs = (running,) if is_one_cost else (running, task.terminal_cost(episode, state))
+        return (costs, violations(task, state, action))
 
     start = at_rest(episode.start)
-    _, (running, *terminal) = engine.rollout(physics, start, then_idle(actions, 1), observe)
+    followed = then_idle(actions, 1)
+    _, ((running, *terminal), nearer) = engine.rollout(physics, start, followed, observe)
     costs = running
     if terminal:
         costs = jnp.concatenate([running[..., :-1], terminal[0][..., -1:]], axis=-1)
     if task.running_weight != 1:
         weights = np.append(np.full(actions.pick.shape[0], task.running_weight), 1.0)
         costs = costs * np.broadcast_to(weights.astype(costs.dtype), costs.shape)
-    return engine.risk(costs.sum(axis=-1))
+    return engine.risk(with_penalty(costs.sum(axis=-1), nearer))
 
 
-def settled_score(
+def settled_cost(
     task: Task, engine: SearchEngine, physics: PyTree[Any], episode: Episode, actions: Actions
 ) -> Float[Array, ""]:
-    """Score of the settled state after a plan.
+    """1 minus the score of the settled state after a plan, and what grippers too near cost.
 
     Raises:
         ValueError: if the plan is not of the body, see `jaxsimp.dynamics.Actions`.
     """
     actions = require_actions(actions, task.body.num_particles)
     followed = then_idle(actions, task.settle_actions)
-    final, _ = engine.rollout(physics, at_rest(episode.start), followed, lambda *_: ())
-    return score(task, episode, final.position)
+    final, nearer = engine.rollout(
+        physics, at_rest(episode.start), followed, partial(violations, task)
+    )
+    return with_penalty(1.0 - score(task, episode, final.position), nearer)
+
+
+def violations(task: Task, state: State, action: Actions) -> tuple[Float[Array, ""], ...]:
+    """How much nearer grippers came than the task allows, metres; nothing if it has no limit."""
+    least = task.gripper_distance
+    return (violation(least, state.position, action),) if least else ()
+
+
+def with_penalty(
+    cost: Float[Array, "*E"], nearer: tuple[Float[Array, "*E T"], ...]
+) -> Float[Array, "*E"]:
+    """A cost, and what `violations` of each action add to it."""
+    return sum((WEIGHT * each.sum(axis=-1) for each in nearer), start=cost)
 
 
 def require_plan(task: Task, actions: Actions, *, batch: bool = False) -> Actions:

@@ -32,8 +32,9 @@ def require_flat(body: Body) -> None:
     if height > 2 * body.material.thickness + BUMPS * body.size:
         raise ValueError(
             f"the {body.name} is {height:.3g} m high at rest, and does not lie flat. Press "
-            f"it flat (jaxsimp.press, --press), or let it fall flat in a simulation (jaxsimp.settle) and go "
-            f"on from those positions; as it stands it is at body.rest + [0, 0, body.radius]"
+            f"it flat (jaxsimp.press, --press), or let it fall flat in a simulation "
+            f"(jaxsimp.settle) and go on from those positions; as it stands it is at body.rest + "
+            f"[0, 0, body.radius]"
         )
 
 

@@ -32,6 +32,7 @@ from jaxsimp.planning.screening import num_again
 from jaxsimp.planning.space import ActionSpace, Plans
 from jaxsimp.tasks import Episode, Task
 from jaxsimp.tasks.episode import require_episode
+from jaxsimp.tasks.grippers import WEIGHT, plan_violation
 
 ATTEMPTS = 2
 """Number of searches of which the best is kept, where a plan need not be cheap: a search may settle
@@ -259,9 +260,18 @@ class Planner:
         count = len(seeds)
         found = self.plan_batch([episode] * count, [candidates] * count, algorithm, seeds, on_ask)
         done = [self.execute(episode, plan.actions) for plan in found]
-        best = int(np.argmax([np.nan_to_num(one.score, nan=-np.inf) for one in done]))
+        merits = [self._merit(*pair) for pair in zip(found, done, strict=True)]
+        best = int(np.argmax(np.nan_to_num(merits, nan=-np.inf)))
         actions, optimum = found[best].actions, found[best].optimum
         return combined(actions, found, optimum, count, count * PRICES["settled"]), done[best]
+
+    def _merit(self, plan: Plan, execution: Execution) -> float:
+        """Score of an execution, less what grippers cost that came too near."""
+        least, moved = self.task.gripper_distance, execution.positions[:-1]
+        if not least:
+            return execution.score
+        nearer = plan_violation(least, jnp.asarray(moved), plan.actions)
+        return execution.score - WEIGHT * float(nearer)
 
     def prepare(
         self,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsimp.dynamics import Actions
-from jaxsimp.engines import MassSprings, SearchEngine, plan_cost, settled_score
+from jaxsimp.engines import MassSprings, SearchEngine, plan_cost, settled_cost
 from jaxsimp.planning.algorithm import Wants
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints
@@ -77,12 +77,12 @@ class TaskProblem:
         return plan_cost(self.task, self.engine, self.physics, self.episode, actions)
 
     def settled_cost(self, actions: Actions) -> Float[Array, ""]:
-        """1 minus the score of the settled state, in the physics of the evaluator.
+        """1 minus the score of the settled state, in the evaluator's physics: `settled_cost`.
 
         Raises:
             ValueError: if the problem has no evaluator.
         """
-        return 1.0 - settled_score(
+        return settled_cost(
             self.task, self._evaluator, self.evaluator_physics, self.episode, actions
         )
 

@@ -97,6 +97,7 @@ class SavedPlan:
                 "longest_time_step": told["time_step"],
                 # Files of before 0.2 have none: their costs were summed alike.
                 "running_weight": told.get("running_weight", 1.0),
+                "gripper_distance": told.get("gripper_distance", 0.0),
                 "episode_fn": FixedStart(self.episode),
                 "obstacles": _obstacles(told),
                 "pinch": None if told.get("pinch") is None else Pinch(**told["pinch"]),
@@ -286,6 +287,7 @@ def _task_text(task: Task) -> dict[str, Any]:
         "resolution": task.resolution,
         **{name: getattr(task, name) for name in SETTINGS},
         "running_weight": task.running_weight,
+        "gripper_distance": task.gripper_distance,
         "cost": next((name for name, cost in COSTS.items() if cost is task.terminal_cost), None),
         "time_step": task.time_step,
         "pinch": None if task.pinch is None else dataclasses.asdict(task.pinch),

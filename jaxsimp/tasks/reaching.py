@@ -39,6 +39,7 @@ def reach(
     limits: tuple[float, float, float] | None = None,
     obstacles: tuple[Obstacle, ...] = (Table(),),
     pinch: Pinch | None = None,
+    gripper_distance: float = 0.0,
     name: str = "reach",
 ) -> Task:
     """A task: bring a body from a start to a goal.
@@ -60,6 +61,7 @@ def reach(
             the goal is so far away that `num_actions` would not reach it.
         obstacles: rigid bodies at rest, in the order in which they act.
         pinch: what a picker holds besides the particle that an action names.
+        gripper_distance: least distance of two pickers that both hold something, metres.
         name: name of the task.
 
     Raises:
@@ -97,6 +99,7 @@ def reach(
         longest_time_step=min(Task.longest_time_step, 0.99 * longest_contact_step(body, fastest)),
         obstacles=obstacles,
         pinch=pinch,
+        gripper_distance=gripper_distance,
         name=name,
     )
 

@@ -37,6 +37,8 @@ from jaxsimp.tasks.episode import (
 
 COUNTS = {"num_actions": (1, 10_000), "num_pickers": (1, 1000), "settle_actions": (0, 10_000)}
 """Least and most of a task's counts."""
+FARTHEST_GRIPPERS = 10.0
+"""Most of a task's `gripper_distance`, metres."""
 SECONDS = {"action_seconds": (1e-4, 1e4), "longest_time_step": (1e-6, 1.0)}
 """Least and most of a task's times, seconds."""
 
@@ -63,6 +65,8 @@ class Task:
             cost counts once; 1 for the paper's sum.
         obstacles: rigid bodies at rest, in the order in which they act.
         pinch: what a picker holds besides the particle that an action names; None for that alone.
+        gripper_distance: least distance of two pickers that both hold something, metres; plans in
+            which they come nearer cost more, see `jaxsimp.tasks.grippers`. 0 for no limit.
         draw_fn: function from a key to an episode, in pure JAX; None if `episode_fn` alone makes
             episodes.
         name: name of the task; for a registered task that of its factory, see `register`.
@@ -89,6 +93,7 @@ class Task:
     running_weight: float = 1.0
     obstacles: tuple[Obstacle, ...] = (Table(),)
     pinch: Pinch | None = None
+    gripper_distance: float = 0.0
     draw_fn: DrawFn | None = None
     name: str = "unnamed"
     resolution: int | None = None
@@ -99,6 +104,9 @@ class Task:
         own: dict[str, object] = {
             "limits": require_limits(self.limits),
             "running_weight": require_number("running_weight", self.running_weight, 0.0, 1e6),
+            "gripper_distance": require_number(
+                "gripper_distance", self.gripper_distance, 0.0, FARTHEST_GRIPPERS, "m"
+            ),
         }
         require_pinch(self.pinch)
         if not isinstance(self.name, str):

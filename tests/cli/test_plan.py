@@ -9,6 +9,7 @@ import trimesh
 import jaxsimp as js
 from jaxsimp import goal_plan, goals
 from jaxsimp.cli.main import main
+from jaxsimp.engines import least_distance
 from jaxsimp.planning import CEM, Joint
 
 ROPE = js.rope(11, 0.4)
@@ -45,6 +46,8 @@ def test_a_goal_becomes_a_folder_with_plan_report_and_figures(tmp_path, capsys):
     assert len(result["scores"]) == 2
     assert status == (0 if result["success"] else 1)
     assert 0 < result["mujoco_full_score"] <= 1
+    scene = js.scene_of_plan(js.load_plan(result["plan"]))
+    assert result["least_gripper_distance"] == least_distance(scene.trajectory)
     saved = js.load_plan(result["plan"])
     assert saved.about["score"] == result["score"]
     for name in ("plan.png", "key_points.png"):

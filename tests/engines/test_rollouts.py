@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsimp.dynamics import NONE, Actions, at_rest, rollout
-from jaxsimp.engines import MassSprings, plan_cost, settled_score, then_idle
+from jaxsimp.engines import MassSprings, plan_cost, settled_cost, then_idle
 from jaxsimp.engines.rollouts import require_plan
 from jaxsimp.tasks import make_task
 
@@ -46,15 +46,15 @@ def test_a_plan_costs_its_actions_and_the_state_that_it_leaves(weight):
     assert speeds[2] > 1e-3  # the action with nothing held has no running cost
 
 
-def test_the_settled_score_is_that_of_the_execution():
+def test_the_settled_cost_is_that_of_the_execution():
     task = dataclasses.replace(
         make_task("rope_letter_u", 7), num_actions=1, action_seconds=0.1, settle_actions=2
     )
     actions = Actions(jnp.array([[0, 6]]), jnp.full((1, 2, 3), 0.05))
     engine, episode = MassSprings(), task.episode_fn(0)
-    found = settled_score(task, engine, engine.physics(task), episode, actions)
+    found = settled_cost(task, engine, engine.physics(task), episode, actions)
     done = engine.executor(task)(episode, actions)
-    np.testing.assert_allclose(found, done.score, atol=1e-5)  # float32, other machine code
+    np.testing.assert_allclose(found, 1.0 - done.score, atol=1e-5)  # float32, other machine code
 
 
 @pytest.mark.usefixtures("unchecked_shapes")

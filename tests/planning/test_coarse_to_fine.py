@@ -189,7 +189,7 @@ def test_all_is_compiled_before_the_first_plan(monkeypatch):
     space = action_space(fresh.task, CANDIDATES)
     assert fresh.prepare(SEARCH, space) > 0
     exchanges = host._compile.cache_info().misses
-    for name in ("plan_cost", "settled_score"):  # what is traced fails
+    for name in ("plan_cost", "settled_cost"):  # what is traced fails
         monkeypatch.setattr(problem, name, None)
     plan = fresh.plan(fresh.task.episode_fn(6), CANDIDATES, SEARCH, 6)
     assert host._compile.cache_info().misses == exchanges

@@ -285,7 +285,7 @@ def test_what_a_sequence_costs_adds_up_and_is_compiled_once(monkeypatch):
     assert plan.optimum.cost == made.costs(episode, one)[0]
     exchanges = host._compile.cache_info().misses
     monkeypatch.setattr(problem, "plan_cost", None)  # what is traced fails
-    monkeypatch.setattr(problem, "settled_score", None)
+    monkeypatch.setattr(problem, "settled_cost", None)
     assert_same(made.plan(episode, CANDIDATES, SEQUENCE, 3), plan)
     assert host._compile.cache_info().misses == exchanges
 
