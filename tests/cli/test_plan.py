@@ -1,6 +1,8 @@
 """The command from a goal to a plan: what it writes, resumes and refuses."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,8 @@ import trimesh
 import jaxsimp as js
 from jaxsimp import goal_plan, goals
 from jaxsimp.cli.main import main
+from jaxsimp.cli.plan import Options
+from jaxsimp.cli.plan_goal import body_and_goal
 from jaxsimp.engines import least_distance
 from jaxsimp.planning import CEM, Joint
 
@@ -28,11 +32,6 @@ def small_search(monkeypatch, tmp_path):
 def command(*options):
     """What `jaxsimp plan` does, without another process."""
     return main(["plan", *map(str, options)])
-
-
-def told(capsys):
-    """What the command wrote to stderr, in one line."""
-    return " ".join(capsys.readouterr().err.split())
 
 
 def test_a_goal_becomes_a_folder_with_plan_report_and_figures(tmp_path, capsys):
@@ -112,37 +111,33 @@ def test_named_goals_and_a_start_of_ones_own(tmp_path):
     assert len(saved.actions.pick) == 1
 
 
-def test_a_garment_of_a_file_is_meshed_anew_pressed_and_folded(tmp_path, capsys):
+def test_a_garment_of_a_file_is_meshed_anew_pressed_and_folded(tmp_path):
     tube = trimesh.creation.cylinder(0.1, 0.3, sections=40, transform=LYING)
-    open_ends = tube.face_normals[:, 1].round(3)
-    tube.update_faces(np.abs(open_ends) < 0.5)
+    tube.update_faces(np.abs(tube.face_normals[:, 1]) < 0.5)  # without its ends
     tube.subdivide().export("tube.obj")
-    options = ("--fold", "side", "--body", "tube.obj", "--particles", 60, "--no-verify")
-    assert command(*options) == 2
-    assert "does not lie flat. Press it flat (jaxsimp.press, --press)" in told(capsys)
-    command(*options, "--press", "--out", "one", "--actions", 1)
-    assert "the mesh lies in layers" in told(capsys)
-    command(*options, "--press", "--pinch", 0.08, 2, "--out", "here")
-    assert "hint" not in told(capsys)
-    saved = js.load_plan(tmp_path / "here" / "plan.npz")
-    body, goal = saved.body, saved.episode.goal
+    options = Options(fold="side", body=Path("tube.obj"), particles=60)
+    with pytest.raises(ValueError, match=r"not lie flat. Press it flat \(jaxsimp.press, --press"):
+        body_and_goal(options)
+    with pytest.warns(UserWarning, match="the mesh lies in layers, .*--pinch 0.09. 3 holds all"):
+        body_and_goal(replace(options, press=True))
+    body, goal = body_and_goal(replace(options, press=True, pinch=(0.09, 3)))
     assert body.num_particles == pytest.approx(60, rel=0.1)
     # Pressed, the tube is half its circumference wide; folded, half as wide again, in four layers.
     across = np.ptp(body.rest[:, :2], axis=0)
     assert np.abs(across - np.pi * 0.1).min() < 0.03
-    assert np.ptp(goal[:, 0]) == pytest.approx(np.ptp(body.rest[:, 0]) / 2, rel=0.1)
-    assert np.ptp(goal[:, 2]) >= 3 * 2 * body.radius * 0.9
+    assert np.ptp(goal[:, 0]) == pytest.approx(across[0] / 2, rel=0.1)
+    assert np.ptp(goal[:, 2]) >= 0.9 * 3 * 2 * body.radius
 
 
 @pytest.mark.parametrize(
     ("fold", "name"), [("sleeves_in", "t_shirt"), ("leg_over_leg", "trousers")]
 )
-def test_garments_made_from_dimensions_are_folded_by_name(fold, name, tmp_path):
-    command("--fold", fold, "--particles", 80, "--actions", 1, "--no-verify", "--out", "here")
-    saved = js.load_plan(tmp_path / "here" / "plan.npz")
+def test_garments_made_from_dimensions_are_folded_by_name(fold, name):
+    body, goal = body_and_goal(Options(fold=fold, particles=80))
     garment = getattr(js, name)(num_particles=80)
+    np.testing.assert_array_equal(body.rest, garment.body.rest)
     wanted = goals.fold_sequence(garment.body, getattr(goals, fold)(garment))
-    np.testing.assert_allclose(saved.episode.goal, wanted, atol=1e-6)
+    np.testing.assert_array_equal(goal, wanted)
 
 
 def test_points_of_another_order_are_registered_and_told(tmp_path, capsys):
