@@ -59,7 +59,7 @@ def load_mesh(path: str | Path, *, scale: float = 1.0, up: str | None = None) ->
         warnings.warn(
             f"{path} has narrow triangles, which make the longest stable time step "
             f"{stiffer**0.5:.0f} to {stiffer:.0f} times shorter: replace them by "
-            f"jaxsimp.bodies.remesh(points, faces, num_points)",
+            f"jaxsimp.bodies.remesh(points, faces, num_points) (--particles)",
             stacklevel=2,
         )
     return points, faces

@@ -78,7 +78,10 @@ def _body(options: "Options") -> "Body | None":
 
     body = jaxsimp.cloth() if options.fold and options.particles else None
     if options.body:
-        body = goals.load_body(options.body, scale=options.scale, up=options.up)
+        with warnings.catch_warnings():
+            if options.particles:  # which replaces them
+                warnings.filterwarnings("ignore", message=".* has narrow triangles")
+            body = goals.load_body(options.body, scale=options.scale, up=options.up)
     if body is None:
         return None
     if options.particles:

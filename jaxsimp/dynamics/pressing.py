@@ -65,7 +65,7 @@ def press(body: Body, *, facing: tuple[float, float, float] | None = None) -> Bo
     if change > SHRINKS:
         raise ValueError(
             f"pressed flat, the edges of the {body.name} change by {change:.0%} in the median; "
-            f"{SHRINKS:.0%} is the limit: give a garment, or cut the body open"
+            f"{SHRINKS:.0%} is the limit: mesh it finer, give a garment, or cut the body open"
         )
     least = 1e-3 * body.rest_length  # particles above each other on a crease
     return dataclasses.replace(body, rest=rest, rest_length=np.maximum(length, least))
