@@ -63,6 +63,14 @@ def test_starts_that_are_given_and_crumpled():
         task.draw_episode(jax.random.key(0))
 
 
+def test_a_crumpled_body_can_be_laid_flat_where_a_flat_one_is_refused():
+    flat = goals.flat(ROPE)
+    with pytest.raises(ValueError, match="at the goal already"):
+        reach(ROPE, flat)
+    task = reach(ROPE, flat, start="crumpled")
+    assert np.abs(task.episode_fn(0).start - flat).max() > 0.05
+
+
 def test_limits_and_durations_are_the_papers_at_its_sizes():
     for task, name in ((reach(cloth((7, 7)), SIDE), "cloth_side_folding"),):
         paper = make_task(name, 7)
