@@ -55,7 +55,7 @@ print(f"{len(key_points.particles)} key points of {towel.num_particles} particle
 # start.
 
 # %%
-plan = js.plan(towel, goal, seed=0)
+plan = js.plan(towel, goal, seed=0, search="cem" if SMALL else "default")
 print(f"score {plan.score:.3f}, {plan.search.num_rollouts} rollouts")
 for number, (picks, moves) in enumerate(
     zip(plan.actions.pick, plan.actions.displacement, strict=True)

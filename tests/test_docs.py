@@ -24,7 +24,11 @@ from jaxsimp.tasks import registry
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-SMALL = {"make_task": {"quick": True}, "CEM": {"population": 16}}
+SMALL = {
+    "make_task": {"quick": True},
+    "CEM": {"population": 16},
+    "plan": {"search": "cem"},
+}
 """Functions of the face that blocks call at another size than the reader: arguments by default."""
 
 

@@ -18,45 +18,30 @@ pytest.importorskip("mkdocs")  # the extra `docs`
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory) -> Path:
-    """The site, built as for readers, but for the notebooks, which their own tests run."""
-    folder = tmp_path_factory.mktemp("site")
-    built = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
-        cwd=ROOT,
-        env={**os.environ, "JAXSIMP_SITE_EXECUTES": "false"},
-        capture_output=True,
-        text=True,
-    )
-    assert built.returncode == 0, built.stderr
-    return folder
-
-
 @pytest.mark.slow
-def test_the_reference_has_every_name_of_the_face(site):
+def test_the_site_builds_and_has_all_names_commands_and_links(tmp_path):
+    """One test, since the site takes a while; without notebooks, which their own tests run."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = {**os.environ, "JAXSIMP_SITE_EXECUTES": "false"}
+    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+
     # The inventory of Sphinx: four lines of text, and the names, compressed.
-    packed = (site / "objects.inv").read_bytes().split(b"\n", 4)[4]
+    packed = (tmp_path / "objects.inv").read_bytes().split(b"\n", 4)[4]
     names = {line.split()[0] for line in zlib.decompress(packed).decode().splitlines()}
     wanted = {f"jaxsimp.{name}" for name in jaxsimp.__all__ if name != "__version__"}
     assert wanted <= names, sorted(wanted - names)
 
-
-@pytest.mark.slow
-def test_the_page_of_commands_has_every_verb_with_its_options(site):
-    page = (site / "reference/commands/index.html").read_text()
+    commands = (tmp_path / "reference/commands/index.html").read_text()
     for verb in VERBS:
-        assert f"usage: jaxsimp {verb}" in page
-    assert "<!-- help" not in page
+        assert f"usage: jaxsimp {verb}" in commands
+    assert "<!-- help" not in commands
 
-
-@pytest.mark.slow
-def test_no_link_leads_out_of_the_site(site):
     inside = re.compile(r'(?:href|src)="(?!\w+:|#|data:)([^"#?]+)')
-    for page in site.rglob("index.html"):
+    for page in tmp_path.rglob("index.html"):
         for link in inside.findall(page.read_text()):
             target = (page.parent / link).resolve()
-            assert target.exists(), f"{page.relative_to(site)}: {link}"
+            assert target.exists(), f"{page.relative_to(tmp_path)}: {link}"
 
 
 def hooks():
