@@ -49,6 +49,14 @@ def callback(what: str, signature: Any, function: Any) -> Any:
     return made
 
 
+def is_missing(function: Any) -> bool:
+    """Whether a function is to be compiled, and there is a folder that would keep it."""
+    try:
+        return Kept is not None and not Kept(function, "").has_any()
+    except (RuntimeError, AttributeError, TypeError, OSError):  # as in `_keep`
+        return False
+
+
 def _keep(compiled: Any, function: Any, what: str) -> Any:
     """What numba made of a function, with a cache that tells."""
     if Kept is None or not hasattr(compiled, "_cache"):  # absent under NUMBA_DISABLE_JIT, too

@@ -65,6 +65,10 @@ class Kept(FunctionCache):
         stamp = _stamp(Path(function.__code__.co_filename).parent)  # numba's is of one file
         self._cache_file = IndexDataCacheFile(self._cache_path, self._impl.filename_base, stamp)
 
+    def has_any(self) -> bool:
+        """Whether anything was kept that is fresh."""
+        return bool(self._cache_file._load_index())
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What was kept for these types; None if it has to be compiled, which is said once."""
         try:

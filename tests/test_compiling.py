@@ -96,6 +96,18 @@ def test_what_was_kept_is_loaded_without_a_word(folder, caplog):
     assert sum(module.outer.stats.cache_hits.values()) == 1
 
 
+def test_what_is_missing_is_known_without_compiling_it(folder, caplog):
+    module = load()
+    function = module.outer.py_func
+    assert compiling.is_missing(function)
+    assert not caplog.messages
+    module.outer(3)
+    assert not compiling.is_missing(function)
+    (folder / "inner.py").write_text((folder / "inner.py").read_text() + "# changed\n")
+    numba_cache._stamp.cache_clear()
+    assert compiling.is_missing(function)
+
+
 def test_a_callback_is_kept_too(folder, caplog):
     found = load().make_callback()
     assert found.ctypes(3) == 7
@@ -132,6 +144,10 @@ def nowhere(folder, monkeypatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "file"))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     return folder
+
+
+def test_where_nothing_can_be_kept_nothing_is_missing(nowhere):
+    assert not compiling.is_missing(load().outer.py_func)
 
 
 def test_without_a_folder_it_is_compiled_each_time_and_the_remedy_is_named(nowhere, caplog):

@@ -15,6 +15,7 @@ from rich.console import Console
 
 import jaxsimp
 from jaxsimp.cli import plan_report
+from jaxsimp.cli.beside import contact_compiled_beside
 from jaxsimp.cli.hints import told_hints
 from jaxsimp.cli.plan_report import FIGURE_FILE, PAGE_FILE, PLANS_FOLDER, ROWS_FILE, Row
 
@@ -137,7 +138,8 @@ class Options:
         console = Console(width=None if sys.stdout.isatty() else 100, highlight=False)
         begun = time.perf_counter()
         console.print("key points of the goal; the first time this compiles, for up to a minute")
-        planner = planner_of(self)
+        with contact_compiled_beside():
+            planner = planner_of(self)
         console.print(
             f"{len(planner.key_points)} key points {planner.key_points.particles.tolist()}"
         )
