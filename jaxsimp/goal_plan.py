@@ -19,6 +19,7 @@ from jaxsimp.bodies import Body
 from jaxsimp.checks import require_choice, require_seed
 from jaxsimp.dynamics import Actions, Obstacle, Pinch, Table
 from jaxsimp.engines import Execution, replay
+from jaxsimp.engines.rollouts import merit
 from jaxsimp.goals import Positions
 from jaxsimp.planning import (
     CEM,
@@ -83,6 +84,11 @@ class GoalPlan:
     def score(self) -> float:
         """Score of the settled state: 1 at the goal, 0 for what is as far away as the start."""
         return self.execution.score
+
+    @property
+    def merit(self) -> float:
+        """The score, less the cost of grippers nearer than the task allows; see `Task`."""
+        return merit(self.task, self.actions, self.execution)
 
     @property
     def is_success(self) -> bool:

@@ -98,6 +98,7 @@ def keep_programs() -> None:
         return
     kept = Kept(folder)
     # JAX has no setting for another cache of files, and its own does not write them in one piece.
+    # Types are ignored: `Kept` has the methods that are called, and not the base class.
     compilation_cache.get_file_cache = lambda path: (kept, path)  # type: ignore[assignment, return-value]
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # Most programs compile in less than the second from which on JAX keeps them.

@@ -37,9 +37,9 @@ def _is_to_compile() -> bool:
     import jax
 
     from jaxsimp.compiling import is_missing
+    from jaxsimp.machine import num_cores
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    if cores == 1 or jax.default_backend() != "cpu":
+    if num_cores() == 1 or jax.default_backend() != "cpu":
         return False
     try:
         from jaxsimp.dynamics.contact.cpu.kernels import _touch_float32

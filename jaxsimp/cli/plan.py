@@ -26,7 +26,7 @@ FAILED = 1
 """Exit status if no plan is successful."""
 XYZ = tuple[float, float, float]
 PLAN_FILE, RESULT_FILE, REPORT_FILE = "plan.npz", "result.json", "report.md"
-FIELDS = ("score", "success", "rollouts", "seconds", "compile_seconds", "environment")
+FIELDS = ("score", "merit", "success", "rollouts", "seconds", "compile_seconds", "environment")
 """Fields of a row that the report reads."""
 
 
@@ -80,7 +80,8 @@ class Options:
     """Least distance of two grippers that both hold something, metres; plans in which they come
     nearer cost more."""
     seeds: int = 1
-    """Number of plans, of which the one of the highest score is kept."""
+    """Number of plans, of which the one of the highest score is kept, less what grippers cost
+    that come too near."""
     tolerance: float | None = None
     """Error below which a model of the goal fits, metres; the method's own by default."""
     verify: bool = True
@@ -146,7 +147,7 @@ class Options:
         folder = self.folder
         with jaxsimp.records.open_folder(folder, config(planner)):
             rows = planned(planner, self.seeds, folder, console, mixed=self.mixed)
-            best = max(rows, key=lambda row: -math.inf if row["score"] is None else row["score"])
+            best = max(rows, key=lambda row: -math.inf if row["merit"] is None else row["merit"])
             console.print("replay in MuJoCo, and figures" if self.verify else "figures")
             result = write_result(planner, best, rows, folder, verify=self.verify)
         if self.json:
@@ -265,6 +266,7 @@ def _row(found: "GoalPlan", compile_seconds: float) -> Row:
     return {
         "seed": found.seed,
         "score": found.score if math.isfinite(found.score) else None,
+        "merit": found.merit if math.isfinite(found.merit) else None,
         "success": found.is_success,
         "rollouts": found.search.num_rollouts,
         "counted_rollouts": found.search.price,

@@ -79,6 +79,18 @@ def with_penalty(
     return sum((WEIGHT * each.sum(axis=-1) for each in nearer), start=cost)
 
 
+def merit(task: Task, actions: Actions, execution: Execution) -> float:
+    """Score of an execution, less the cost of grippers too near; minus infinity if unstable."""
+    if not np.isfinite(execution.score):
+        return -np.inf
+    ends = [State(jnp.asarray(end), jnp.zeros_like(end)) for end in execution.positions[1:-1]]
+    each = [
+        violations(task, end, Actions(pick, move))
+        for end, pick, move in zip(ends, actions.pick, actions.displacement, strict=True)
+    ]
+    return execution.score - WEIGHT * float(sum(sum(one) for one in each))
+
+
 def require_plan(task: Task, actions: Actions, *, batch: bool = False) -> Actions:
     """A plan of a task as arrays, or several with a first axis `B`, checked.
 

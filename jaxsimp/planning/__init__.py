@@ -15,7 +15,8 @@ from jaxsimp.planning.encodings import ENCODINGS, Categorical, Encoding, Gaussia
 from jaxsimp.planning.host import search_on_host
 from jaxsimp.planning.local_search import LocalSearch
 from jaxsimp.planning.loop import Optimum, optimize
-from jaxsimp.planning.planner import Plan, Planner
+from jaxsimp.planning.plan import Plan
+from jaxsimp.planning.planner import Planner
 from jaxsimp.planning.problem import Candidates, Problem, TaskProblem, action_space, make_problem
 from jaxsimp.planning.random_shooting import RandomShooting
 from jaxsimp.planning.reranking import Reranking

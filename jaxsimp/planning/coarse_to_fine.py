@@ -19,7 +19,8 @@ from jaxsimp.engines import Engine, Execution, Layout, SearchEngine
 from jaxsimp.planning.algorithm import Algorithm, Sequence, stages
 from jaxsimp.planning.between_bodies import carried_positions, nearest_particles, renamed
 from jaxsimp.planning.local_search import LocalSearch
-from jaxsimp.planning.planner import ATTEMPTS, Plan, Planner, combined
+from jaxsimp.planning.plan import Plan, combined
+from jaxsimp.planning.planner import ATTEMPTS, Planner
 from jaxsimp.planning.problem import Candidates, action_space
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from collections.abc import Sequence as Seq
-from dataclasses import dataclass
 from functools import cached_property
 
 import jax
@@ -21,74 +20,22 @@ from jaxsimp.engines import (
     MassSprings,
     SearchEngine,
 )
-from jaxsimp.engines.rollouts import as_float, require_plan
+from jaxsimp.engines.rollouts import as_float, merit, require_plan
 from jaxsimp.planning.algorithm import PRICES, Algorithm, Sequence, Told, stages
 from jaxsimp.planning.default import default_algorithm
 from jaxsimp.planning.evaluations import Evaluations, evaluations_of
 from jaxsimp.planning.host import compiled_exchanges, questions
-from jaxsimp.planning.loop import Optimum, Question, answered, archive_size
+from jaxsimp.planning.loop import Question, answered, archive_size
+from jaxsimp.planning.plan import Plan, combined
 from jaxsimp.planning.problem import Candidates, action_space
 from jaxsimp.planning.screening import num_again
 from jaxsimp.planning.space import ActionSpace, Plans
 from jaxsimp.tasks import Episode, Task
 from jaxsimp.tasks.episode import require_episode
-from jaxsimp.tasks.grippers import WEIGHT, plan_violation
 
 ATTEMPTS = 2
 """Number of searches of which the best is kept, where a plan need not be cheap: a search may settle
 on picks from which no descent leads to the goal, and seldom do two."""
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A plan and the record of its search.
-
-    Attributes:
-        actions: the plan, shapes (T, G) and (T, G, 3).
-        optimum: costs by question, the best distinct plans, and failures.
-        num_rollouts: number of plans evaluated.
-        price: price of the search, in rollouts: a gradient counts as several, see `PRICES`.
-        seconds: search time without compilation, seconds.
-        compile_seconds: compilation time, seconds; near 0 if an earlier plan had the same number
-            of candidates and the same algorithm.
-        parts: the plans of several searches that it was made from; empty for one search.
-    """
-
-    actions: Actions
-    optimum: Optimum
-    num_rollouts: int
-    price: int
-    seconds: float
-    compile_seconds: float
-    parts: tuple["Plan", ...] = ()
-
-    @property
-    def searches(self) -> tuple["Plan", ...]:
-        """The single searches that it was made from, in order; itself if it is one."""
-        return tuple(one for part in self.parts for one in part.searches) or (self,)
-
-
-def combined(
-    actions: Actions, parts: Seq[Plan], optimum: Optimum, num_rollouts: int = 0, price: int = 0
-) -> Plan:
-    """A plan made from those of several searches, with sums of their numbers.
-
-    Args:
-        actions: the plan.
-        parts: the plans of the searches.
-        optimum: costs by question, as of one of the parts.
-        num_rollouts: number of plans evaluated between the searches.
-        price: price of these, in rollouts.
-    """
-    return Plan(
-        actions=actions,
-        optimum=optimum,
-        num_rollouts=num_rollouts + sum(part.num_rollouts for part in parts),
-        price=price + sum(part.price for part in parts),
-        seconds=sum(part.seconds for part in parts),
-        compile_seconds=sum(part.compile_seconds for part in parts),
-        parts=tuple(parts),
-    )
 
 
 class Planner:
@@ -260,18 +207,11 @@ class Planner:
         count = len(seeds)
         found = self.plan_batch([episode] * count, [candidates] * count, algorithm, seeds, on_ask)
         done = [self.execute(episode, plan.actions) for plan in found]
-        merits = [self._merit(*pair) for pair in zip(found, done, strict=True)]
-        best = int(np.argmax(np.nan_to_num(merits, nan=-np.inf)))
+        pairs = zip(found, done, strict=True)
+        merits = [merit(self.task, plan.actions, execution) for plan, execution in pairs]
+        best = int(np.argmax(merits))
         actions, optimum = found[best].actions, found[best].optimum
         return combined(actions, found, optimum, count, count * PRICES["settled"]), done[best]
-
-    def _merit(self, plan: Plan, execution: Execution) -> float:
-        """Score of an execution, less what grippers cost that came too near."""
-        least, moved = self.task.gripper_distance, execution.positions[:-1]
-        if not least:
-            return execution.score
-        nearer = plan_violation(least, jnp.asarray(moved), plan.actions)
-        return execution.score - WEIGHT * float(nearer)
 
     def prepare(
         self,

@@ -23,7 +23,8 @@ from jaxsimp.planning.cem import CEM
 from jaxsimp.planning.descent import Descent
 from jaxsimp.planning.encodings import Joint
 from jaxsimp.planning.local_search import LocalSearch
-from jaxsimp.planning.planner import ATTEMPTS, Plan, Planner, combined
+from jaxsimp.planning.plan import Plan, combined
+from jaxsimp.planning.planner import ATTEMPTS, Planner
 from jaxsimp.planning.problem import Candidates
 from jaxsimp.planning.space import ActionSpace, as_candidates
 from jaxsimp.simplification import KeyPoints

@@ -2,7 +2,6 @@
 
 from itertools import combinations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -42,16 +41,3 @@ def _nearest(start: Float[Array, "3"], way: Float[Array, "3"]) -> Float[Array, "
     nearest = start + jnp.clip(jnp.where(length > 0, share, 0.0), 0.0, 1.0) * way
     square = nearest @ nearest
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-
-
-def plan_violation(
-    least: float, positions: Float[Array, "T1 N 3"], actions: Actions
-) -> Float[Array, ""]:
-    """Sum of `violation` over a plan, metres.
-
-    Args:
-        least: least distance of two pickers that both hold something, metres.
-        positions: positions at the start and after each action, shape (T + 1, N, 3), metres.
-        actions: the plan, shapes (T, G) and (T, G, 3).
-    """
-    return jax.vmap(lambda *each: violation(least, *each))(positions[1:], actions).sum()

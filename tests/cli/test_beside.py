@@ -1,16 +1,13 @@
 """Compiling on another core: when it is begun, that it is waited for, and ended."""
 
-import os
 import subprocess
 import sys
 
 import jax
 import pytest
 
-from jaxsimp import compiling
+from jaxsimp import compiling, machine
 from jaxsimp.cli import beside
-
-pytestmark = pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores of Linux")
 
 
 @pytest.fixture
@@ -26,7 +23,7 @@ def begun(monkeypatch):
 
     monkeypatch.setattr(beside.subprocess, "Popen", begin)
     monkeypatch.setattr(compiling, "is_missing", lambda function: True)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 1})
+    monkeypatch.setattr(machine, "num_cores", lambda: 2)
     return found
 
 
@@ -47,7 +44,7 @@ def test_it_is_not_begun_where_it_is_of_no_use(begun, reason, monkeypatch):
     if reason == "kept":
         monkeypatch.setattr(compiling, "is_missing", lambda function: False)
     if reason == "one core":
-        monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0})
+        monkeypatch.setattr(machine, "num_cores", lambda: 1)
     if reason == "gpu":
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with beside.contact_compiled_beside():

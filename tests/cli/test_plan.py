@@ -82,6 +82,18 @@ def test_the_same_command_resumes(tmp_path, monkeypatch):
     assert "mujoco_full_score" not in json.loads((folder / "result.json").read_text())
 
 
+def test_the_best_of_several_seeds_is_that_of_the_highest_merit(tmp_path):
+    command("l.npy", "--seeds", 2, "--no-verify")
+    folder = tmp_path / "l-plan"
+    rows = [json.loads(line) for line in (folder / "plans.jsonl").read_text().splitlines()]
+    assert all(row["merit"] == row["score"] for row in rows)  # without a distance of grippers
+    other = min(rows, key=lambda row: row["score"])
+    other["merit"] = 2.0
+    (folder / "plans.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    command("l.npy", "--seeds", 2, "--no-verify")
+    assert json.loads((folder / "result.json").read_text())["seed"] == other["seed"]
+
+
 def test_rows_of_another_environment_are_kept_where_that_is_asked_for(tmp_path, capsys):
     command("l.npy", "--no-verify")
     rows = tmp_path / "l-plan" / "plans.jsonl"

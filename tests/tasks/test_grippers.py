@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 import jaxsimp as js
 from jaxsimp import goals
 from jaxsimp.engines import least_distance, plan_cost, settled_cost
+from jaxsimp.engines.rollouts import merit
 from jaxsimp.planning import CEM, Joint
-from jaxsimp.tasks.grippers import WEIGHT, plan_violation, violation
+from jaxsimp.tasks.grippers import WEIGHT, violation
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -50,10 +51,17 @@ def test_a_plan_costs_more_by_how_much_nearer_grippers_come():
     plan = js.Actions(
         jnp.array([[0, 1], [6, js.NONE]]), jnp.full((2, 2, 3), 0.02).at[0, 1].set(-0.02)
     )
-    moved = engine.executor(free)(episode, plan).positions
-    near = float(plan_violation(0.2, jnp.asarray(moved[:-1]), plan))
+    done = engine.executor(free)(episode, plan)
+    moved = done.positions
+    near = sum(
+        float(violation(0.2, jnp.asarray(end), js.Actions(plan.pick[t], plan.displacement[t])))
+        for t, end in enumerate(moved[1:-1])
+    )
     assert near > 0.05  # neighbours of a rope of 7 are 0.08 m apart
     apart = dataclasses.replace(free, gripper_distance=0.2)
+    assert merit(free, plan, done) == done.score
+    assert merit(apart, plan, done) == pytest.approx(done.score - WEIGHT * near, abs=1e-6)
+    assert merit(apart, plan, dataclasses.replace(done, score=np.nan)) == -np.inf
     for cost in (plan_cost, settled_cost):
         without, with_limit = (
             cost(task, engine, engine.physics(task), episode, plan) for task in (free, apart)
